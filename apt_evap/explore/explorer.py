@@ -566,12 +566,22 @@ class Explorer:
 
     def _structures(self, maps):
         """Structure of both maps about a pole, None without one whose rings are on the maps."""
-        region = replace(maps.measured, mask=maps.measured.mask & maps.simulated.mask)
-        try:
-            measure = PoleMeasure(self.run, self.registration, region)
-        except ValueError:
+        measure, measured = self._measured_structure(maps)
+        if measure is None:
             return None, None
-        return tuple(measure.structure(replace(counts, mask=region.mask)) for counts in (maps.simulated, region))
+        return measure.structure(maps.simulated), measured
+
+    def _measured_structure(self, maps):
+        """Measure of a pole, and the structure of the measured map, kept for all emissions; None without a pole."""
+        key = "structure", maps.settings.bins, self.registration
+        if key not in self._kept_maps:
+            try:
+                measure = PoleMeasure(self.run, self.registration, maps.measured)
+            except ValueError:
+                self._kept_maps[key] = None, None
+            else:
+                self._kept_maps[key] = measure, measure.structure(maps.measured)
+        return self._kept_maps[key]
 
     def profiles(self, maps: ExplorerMaps, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
         """Profiles across a line on the maps.

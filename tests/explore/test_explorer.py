@@ -17,6 +17,7 @@ from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, 
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.placement import misplaced
 from apt_evap.explore.specimen_surface import surface_atoms
+from apt_evap.fit.structure import PoleMeasure
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
@@ -355,6 +356,39 @@ def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     assert expected.verdict == "alike" and found.reason.startswith(expected.reason)
     # too few ions for lines about the pole, which are not a part of that
     assert found.verdict == "doubtful" and explorer._structures(maps)[0] is None
+
+
+@pytest.mark.parametrize("emission", [ae.Unperturbed(), ae.RollUp(0.2)], ids=repr)
+def test_the_verdict_takes_lines_about_the_pole(run20, emission, monkeypatch):
+    """Maps of one crystal have the same symmetries, also if one of them has dark lines where the other's are bright."""
+    run = replace(run20, perturbations=(), flown=())
+    hits = run.hits(emission)
+    explorer = Explorer(run, ae.Hits(x=hits.x, y=hits.y).within_circle(100.0), ae.Registration(0.0, 1.0, (0.0, 0.0)))
+    measures = []
+
+    class Counted(PoleMeasure):
+        def __init__(self, *arguments):
+            measures.append(self)
+            super().__init__(*arguments)
+
+    monkeypatch.setattr("apt_evap.explore.explorer.PoleMeasure", Counted)
+    verdicts = {}
+    for other in (ae.Unperturbed(), ae.RollUp(0.2)):
+        maps = explorer.show(ExplorerSettings(other, 64, 2.0))
+        assert ae.maps.likeness(maps.simulated, maps.measured, explorer.registration).verdict == "alike"
+        found = explorer.likeness(maps)
+        verdicts[other] = found.verdict
+        assert ("correlate only" in found.reason) == (other != emission)
+        region = PoleMeasure(run, explorer.registration, maps.measured)
+        simulated, measured = explorer._structures(maps)
+        assert np.array_equal(measured.values, region.structure(maps.measured).values, equal_nan=True)
+        assert np.array_equal(simulated.values, region.structure(maps.simulated).values, equal_nan=True)
+    assert {verdict for other, verdict in verdicts.items() if other != emission} == {"doubtful"}
+    assert verdicts[emission] == "alike"
+    assert len(measures) == 1  # the place of the pole and the measured structure are those of all emissions
+    explorer.set_registration(ae.Registration(0.0, 1.0, (0.5, 0.0)))
+    explorer.likeness(explorer.show(ExplorerSettings(emission, 64, 2.0)))
+    assert len(measures) == 2
 
 
 @pytest.mark.parametrize(("rotation", "scale"), [(0.0, 60.0), (20.0, 60.0), (120.0, 60.0), (0.0, 51.0)])
