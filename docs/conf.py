@@ -67,6 +67,7 @@ sphinx_gallery_conf = {
     "examples_dirs": str(GENERATED / "scripts"),
     "gallery_dirs": str(GENERATED / "gallery"),
     "filename_pattern": r"/tutorial_",  # the other examples need a measured file
+    "ignore_pattern": r"visible_pairs",  # belongs to a settings file
     "within_subsection_order": "ExampleTitleSortKey",
     "download_all_examples": False,
     "show_memory": False,

@@ -86,7 +86,7 @@ def put_nxapm(
     put_field(entry, "operation_mode", "apt")
     specimen = put_group(entry, "specimen", "NXsample")
     put_field(specimen, "is_simulation", np.bool_(is_simulation))
-    put_field(specimen, "atom_types", ", ".join(elements))
+    put_field(specimen, "atom_types", ", ".join(dict.fromkeys(elements)))
     for name, value, unit in (("initial_radius", radius, "nm"), ("shank_angle", shank_angle, "deg")):
         if value is not None:
             put_field(specimen, name, float(value), unit)

@@ -16,6 +16,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "example:\n"
+        "  apt-evap examples --to FOLDER                   writes dataset.toml: ten tips, half a minute\n"
         "  apt-evap dataset study.toml --plan              runs, examples, hours, size; runs nothing\n"
         "  apt-evap dataset study.toml -o set --workers 2  make the set, or finish it\n"
         "  apt-evap dataset set                            verify its checksums"

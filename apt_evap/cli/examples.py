@@ -16,7 +16,7 @@ _SUFFIXES = (".py", ".toml")
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = "List the examples of the package: settings files and Python scripts. With --to, copy them."
-    parser.epilog = "example: apt-evap examples --to apt_examples && apt-evap run apt_examples/ni111.toml"
+    parser.epilog = "example:\n  apt-evap examples --to apt_examples\n  apt-evap run apt_examples/particle.toml"
     parser.add_argument("--to", metavar="FOLDER", help="copy the examples to this folder")
     parser.add_argument("--force", action="store_true", help="overwrite files that differ from the examples")
     add_speech(parser)

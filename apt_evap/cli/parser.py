@@ -36,10 +36,11 @@ from a simulation to its map, and to the emission energies of a measured map:
                                                      ions as an instrument would write them
   apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
                                                      positions in the specimen from the hits
-  apt-evap examples --to FOLDER                      settings files and scripts to start from
+  apt-evap examples --to FOLDER                      settings and scripts to start from: of a tip, a precipitate, a
+                                                     grain boundary, `visible`, `sweep` and `dataset`
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
-  apt-evap visible particle.toml                     would this precipitate be found?
+  apt-evap visible visible.toml                      would this precipitate be found?
   apt-evap dataset study.toml -o set                 a data set with the truth of every ion
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """

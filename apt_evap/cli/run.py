@@ -17,7 +17,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "of the last ions that missed, never left the tip, or are flagged (inexact responses). Without a terminal:\n"
         "one line per minute."
     )
-    parser.epilog = "example: apt-evap run examples/ni111.toml -o ni.h5 --ions 5000"
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap examples --to FOLDER                      writes the settings of a pure tip (ni111.toml), of a\n"
+        "                                                     precipitate and of a grain boundary\n"
+        "  apt-evap run FOLDER/ni111.toml -o ni.h5 --ions 5000\n"
+        "  apt-evap run FOLDER/particle.toml                  half a minute\n"
+        "  apt-evap run FOLDER/grain_boundary.toml            half a minute"
+    )
     parser.add_argument("config", metavar="CONFIG.toml")
     parser.add_argument("-o", "--output", metavar="RUN.h5", help="default: output in the file, or its name with .h5")
     parser.add_argument(

@@ -16,6 +16,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "example:\n"
+        "  apt-evap examples --to FOLDER                           writes sweep.toml: four tips, half a minute\n"
         "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
         "  apt-evap sweep work study.toml --workers 4              on this machine\n"
         "  apt-evap sweep work study.toml --point 3                as one task of a cluster\n"

@@ -14,7 +14,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "analysis to them: the probability that it finds the feature, the number of ions that this needs,\n"
         "bias and scatter of size and composition. The Python file of the analysis is run."
     )
-    parser.epilog = "example: apt-evap visible particle.toml --json"
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap examples --to FOLDER              writes visible.toml and its analysis visible_pairs.py\n"
+        "  apt-evap visible FOLDER/visible.toml       a minute at the first call\n"
+        "  apt-evap visible mine.toml --json"
+    )
     parser.add_argument("config", metavar="FILE.toml", help="settings of a simulation, with a table [visibility]")
     parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
     add_speech(parser)

@@ -166,7 +166,7 @@ def specimen_title(run: Run) -> str:
     'Ni, axis [$111$], R = 2.0 nm'
     """
     tip = check_kind(run, "run", Run, "a Run").settings["tip"]
-    parts = [", ".join(run.elements).replace("$", r"\$")]
+    parts = [", ".join(dict.fromkeys(run.elements)).replace("$", r"\$")]
     if "axis" in tip:  # not of a specimen from positions
         axis = tip["axis"]
         whole = all(index == round(index) for index in axis)

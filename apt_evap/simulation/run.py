@@ -178,7 +178,7 @@ class Run:
             responses += f"; {not_flown:,} ions not flown"
         details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
         operating = self.observation.operating
-        return f"<Run: {len(self):,} ions of {', '.join(self.elements)} at {operating}; {details}>"
+        return f"<Run: {len(self):,} ions of {', '.join(dict.fromkeys(self.elements))} at {operating}; {details}>"
 
     @property
     def phase_names(self) -> tuple[str, ...]:

@@ -62,3 +62,47 @@ def test_what_is_refused(folder, capsys, monkeypatch):
     monkeypatch.setattr(examples, "_PLACES", (folder / "none",))
     assert main(["examples"]) == 2
     assert "the examples are not in" in capsys.readouterr().err
+
+
+SETTINGS = sorted(name for name in originals() if name.endswith(".toml"))
+
+
+def test_every_settings_file_is_named_in_the_help_of_its_command(capsys):
+    commands = {"visible.toml": "visible", "sweep.toml": "sweep", "dataset.toml": "dataset"}
+    for name in SETTINGS:
+        assert main([commands.get(name, "run"), "--help"]) == 0
+        assert name in capsys.readouterr().out, name
+
+
+SMALLER = {  # texts of the settings files and what stands for them in a test
+    "visible.toml": {"= 4.0 ": "= 2.2 ", "2.8]": "1.4]", "radius = 0.8": "radius = 0.4", "twins = 20": "twins = 2"},
+    "sweep.toml": {"3_000": "20", "[0, 0, 1], ": "", '"10 a", "14 a"': '"6 a", "7 a"', "14 a": "6 a"},
+    "dataset.toml": {"1_000": "60", "sample = 10": "sample = 2", '"8 a", "12 a"': '"5 a", "6 a"', '["8 a"]': '["5 a"]'},
+}
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of few ions and small specimens
+@pytest.mark.parametrize("name", SETTINGS)
+def test_the_settings_files_work(name, folder, capsys):
+    """Each one with fewer ions or smaller specimens; its keys are those of the example."""
+    assert main(["examples", "--to", ".", "--quiet"]) == 0
+    text = Path(name).read_text()
+    for large, small in SMALLER.get(name, {}).items():
+        assert large in text
+        text = text.replace(large, small)
+    Path(name).write_text(text)
+    match name:
+        case "visible.toml":
+            assert main(["visible", name, "--threads", "1", "--json"]) == 0
+            assert 0 <= json.loads(capsys.readouterr().out)["probability"]["value"] <= 1
+            assert Path("visible_operators.h5").exists()
+        case "sweep.toml":
+            assert all(main(["sweep", action, name]) == 0 for action in ("plan", "work", "collect"))
+            assert "2 of 2 points are done" in capsys.readouterr().out and Path("sweep/report.html").exists()
+        case "dataset.toml":
+            assert main(["dataset", name, "-o", "set", "--quiet"]) == 0
+            assert main(["dataset", "set"]) == 0
+            assert "set: all files are as in its checksums" in capsys.readouterr().out
+        case _:
+            assert main(["run", name, "--ions", "30", "--threads", "1", "--quiet"]) == 0
+            assert Path(name).with_suffix(".h5").exists() and Path(name).with_suffix(".png").exists()

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.plot.map_figures import specimen_title
 from apt_evap.simulation.columns import columns_of
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
@@ -254,3 +255,14 @@ def test_texts_longer_than_an_attribute_are_kept(run, tmp_path):
     words = {"config": "Ω" * 40_000}  # 80 kB in UTF-8
     replace(run, provenance=run.provenance | words).save(tmp_path / "a.h5")
     assert ae.load(tmp_path / "a.h5").provenance["config"] == words["config"]
+
+
+def test_an_element_of_two_phases_is_named_once(tmp_path):
+    particle = ae.specimen.Phase("particle", "Ni", ae.specimen.Sphere((0, 0, 1.0), 0.5), evaporation_field=30.0)
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", "Ni"), particle], apex_radius=1.6, shank_length=1.6)
+    run = ae.Simulation(tip).run(10, responses=False, progress=False)
+    assert run.elements == ("Ni", "Ni")
+    assert "10 ions of Ni at" in repr(run) and specimen_title(run).startswith("Ni, axis")
+    run.save(tmp_path / "run.h5")
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert file["entry1/specimen/atom_types"].asstr()[()] == "Ni"
