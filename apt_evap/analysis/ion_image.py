@@ -366,12 +366,11 @@ def field_ion_image(
     scale, cap_field, radius = _scale_of(emitter, gas, image_field, voltage)
 
     # surface atoms within the angle about the axis
-    tip, positions, normals = emitter.tip, emitter.positions, emitter.normals
-    centre = tip.potential_point
-    chosen = tip.evaporable[emitter.atoms] & (polar_angles(positions - centre) <= angle)
+    tip, centre = emitter.tip, emitter.tip.potential_point
+    chosen = tip.evaporable[emitter.atoms] & (polar_angles(emitter.positions - centre) <= angle)
     if not chosen.any():
         raise ValueError(f"half_angle must include surface atoms that can evaporate, got {half_angle:g} degrees")
-    atoms, positions, normals = emitter.atoms[chosen], positions[chosen], normals[chosen]
+    atoms, positions, normals = (values[chosen] for values in (emitter.atoms, emitter.positions, emitter.normals))
 
     # critical surface: potential of the specimen minus (I - phi) / e; the field of the barrier is (I - phi) / z_c
     inside = positions - _INSIDE * tip.nearest_neighbour_distance * normals

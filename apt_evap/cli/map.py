@@ -66,6 +66,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MM",
         help="figure for a paper, this wide, such as 85: panel letters and a scale bar, no titles",
     )
+    _add_crystal(parser)
+    add_real_units(parser)
+    parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
+    add_speech(parser)
+
+
+def _add_crystal(parser):
+    """Add options of the crystal on the map."""
     group = parser.add_argument_group("crystal", "Poles and zone lines over the map.")
     group.add_argument(
         "--poles",
@@ -84,9 +92,6 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
     group.add_argument("--scale", type=number_type("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
     add_flight(group)
-    add_real_units(parser)
-    parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
-    add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

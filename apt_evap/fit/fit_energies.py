@@ -1,5 +1,6 @@
 """Fit of the emission energies: the simulated map that is most like a measured one."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
@@ -125,21 +126,13 @@ def fit_energies(
     if registration is not None:
         check_kind(registration, "registration", Registration, "a Registration")
     measured = measured_map(measured, settings.bins)
-    bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
-    settings = replace(
-        settings,
-        smoothing=bin_size if settings.smoothing is None else settings.smoothing,
-        replicas=settings.replicas or _replicas(measured, run),
-    )
+    settings = _completed(settings, measured, run)
     search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
     with warnings.catch_warnings():
         # once per energy; the settings contain the same information
         warnings.simplefilter("ignore", ResponseWarning)
         # the transform onto the measured map, which stays fixed from here on
-        rounds: list[Any] = []
-        if registration is None:
-            warnings.simplefilter("ignore", RegistrationWarning)  # given once, for the last registration
-            registration, rounds = register_repeatedly(search)
+        registration, rounds = (registration, []) if registration is not None else _registered(search)
         search.place(registration, settings.resamples)
 
         # scores of the maps of all energies, for all ions and for each resample
@@ -156,26 +149,18 @@ def fit_energies(
         refined = search.optimum(best, bounds)
 
         # maps at these energies and without perturbation, for comparison
-        scores, plain_scores, maps = {}, {}, {}
-        for name, perturbation in (
-            ("unperturbed", Unperturbed()),
-            ("thermal", LateralVelocity(Thermal(settings.temperature))),
-            ("optimum", optimum.perturbation),
-        ):
-            maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation)
+        maps, scores, plain_scores = _compared_maps(search, optimum.perturbation)
         gain = scores.pop("optimum") - scores["unperturbed"]
         structure = _structure_scores(measure, search, structures, maps, cells[0])
     registration.warn_if_doubtful()
     _warn_of_lost_lines(structure, settings)
     _warn_of_few_ions(maps["unperturbed"].ions / search.comparison.mask.sum(), measured)
-    resampled = values[1:]
-    wins = np.ravel_multi_index(cells[1:].T, grid.shape)
     return Study(
         grid=grid,
         scores=values[0],
-        errors=resampled.std(axis=0, ddof=1) if settings.resamples > 1 else np.full(grid.shape, np.nan),
-        shares=np.bincount(wins, minlength=values[0].size).reshape(grid.shape) / max(settings.resamples, 1),
-        resampled=resampled,
+        errors=values[1:].std(axis=0, ddof=1) if settings.resamples > 1 else np.full(grid.shape, np.nan),
+        shares=_shares(cells[1:], grid.shape),
+        resampled=values[1:],
         optimum=optimum,
         refined=refined,
         baselines={name: Score.of_resamples(resamples) for name, resamples in scores.items()},
@@ -190,6 +175,35 @@ def fit_energies(
         settings=settings,
         provenance=_provenance(run, measured, search, rounds, missing),
     )
+
+
+def _completed(settings, measured, run):
+    """Settings with a smoothing and a number of draws, which follow from the map and the run."""
+    bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
+    smoothing = bin_size if settings.smoothing is None else settings.smoothing
+    return replace(settings, smoothing=smoothing, replicas=settings.replicas or _replicas(measured, run))
+
+
+def _registered(search):
+    """Registration of a run, and the rounds of its search; its warning is given once, for the last one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RegistrationWarning)
+        return register_repeatedly(search)
+
+
+def _compared_maps(search, best):
+    """Maps, scores and scores without noise correction, by name: without perturbation, thermal, and at the best one."""
+    thermal = LateralVelocity(Thermal(search.settings.temperature))
+    maps, scores, plain_scores = {}, {}, {}
+    for name, perturbation in (("unperturbed", Unperturbed()), ("thermal", thermal), ("optimum", best)):
+        maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation)
+    return maps, scores, plain_scores
+
+
+def _shares(cells, shape):
+    """Fraction of the resamples in which each point of the grid is the best one."""
+    wins = np.bincount(np.ravel_multi_index(cells.T, shape), minlength=math.prod(shape))
+    return wins.reshape(shape) / max(len(cells), 1)
 
 
 def _warn_of_lost_lines(structure, settings):

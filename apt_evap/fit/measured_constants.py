@@ -132,6 +132,40 @@ class Measurement:
         return "\n".join(rows)
 
 
+@dataclass(frozen=True)
+class _Assumed:
+    """What is assumed about the crystal and the instrument, see `constants_of`; `factors` is the range of `factor`."""
+
+    field: float
+    volume: float
+    lens: LocalElectrode | None
+    factor: float
+    factors: tuple[float, float]
+    length: float | None
+    efficiency: float
+
+    def compression(self, voltage: float) -> float:
+        """Image compression of the lens at a voltage [V]."""
+        lens: Any = self.lens
+        return float(lens.compression(float(lens.radius(voltage, self.field))))
+
+    def arguments(self, disc: Any, scale: float) -> dict[str, Any]:
+        """Arguments of `reconstruct` for a map with this disc and scale."""
+        arguments: dict[str, Any] = {
+            "atomic_volume": self.volume,
+            "evaporation_field": self.field,
+            "efficiency": self.efficiency,
+            "detector_radius": disc.radius - math.hypot(*disc.centre),
+        }
+        if self.length is None:
+            return arguments
+        arguments["distance"] = self.length
+        if self.lens is not None:
+            return arguments | {"lens": self.lens}
+        of_map = {"compression": self.length / scale, "projection": "equidistant", "field_factor": self.factor}
+        return arguments | of_map
+
+
 def constants_of(
     measured: DetectorMap,
     candidate: Candidate,
@@ -215,42 +249,31 @@ def constants_of(
         constants.append(Constant("image compression", compression, error, why))
     if hits is None or (voltages := voltages_of(check_kind(hits, "hits", Hits, "Hits"))) is None:
         return Measurement(tuple(constants), tuple(checks), {})
-    field = material.evaporation_field
+    volume = 1 / atom_density(material.structure, material.a, material.c)
+    factors = FIELD_FACTORS if field_factor is None else (factor, factor)
+    assumed = _Assumed(material.evaporation_field, volume, lens, factor, factors, length, efficiency)
 
     # constants by the voltage: field, radius and field factor; then the angle of the shank by its increase
-    factors = FIELD_FACTORS if field_factor is None else (factor, factor)
-    constants += _voltage_constants(voltages, field, lens, factor, factors)
-    volume = 1 / atom_density(material.structure, material.a, material.c)
+    constants += _voltage_constants(voltages, assumed)
     disc = disc_of(measured)  # a few ions are far outside the field of view
-    constants.append(_shank(hits, disc, scale, volume, efficiency, field, lens, factor, length))
+    constants.append(_shank(hits, disc, scale, assumed))
 
     # observables that were not used: compression of the lens, halves of the ions, multiple hits, charges
     if lens is not None and length is not None:
-        radius = float(lens.radius(float(np.median(voltages)), field))
         checks.append(
             Observed(
                 "image compression of the map, against that of the lens",
                 length / scale,
-                float(lens.compression(radius)),
+                assumed.compression(float(np.median(voltages))),
                 length / scale * (scale_error / scale),
                 "flight length, shank or electrode are wrong; the evaporation field hardly matters",
             )
         )
-    checks += _halves(measured, candidate, hits, voltages, field, lens)
+    checks += _halves(measured, candidate, hits, voltages, assumed)
     checks += _sequence(hits, voltages)
     if ranges is not None and hits.mass_to_charge is not None:
         checks += _charges(hits, material, ranges)
-
-    # arguments of `reconstruct` with these constants
-    arguments: dict[str, Any] = {"atomic_volume": volume, "evaporation_field": field, "efficiency": efficiency}
-    arguments["detector_radius"] = disc.radius - math.hypot(*disc.centre)
-    if length is not None:
-        arguments |= {"distance": length}
-        if lens is None:
-            arguments |= {"compression": length / scale, "projection": "equidistant", "field_factor": factor}
-        else:
-            arguments |= {"lens": lens}
-    return Measurement(tuple(constants), tuple(checks), arguments)
+    return Measurement(tuple(constants), tuple(checks), assumed.arguments(disc, scale))
 
 
 def _scale_of(measured, candidate):
@@ -262,9 +285,10 @@ def _scale_of(measured, candidate):
     return fitted.scale, fitted.scale * math.sqrt(fitted.covariance[3, 3] * fitted.dispersion)
 
 
-def _voltage_constants(voltages, field, lens, factor, factors):
-    """Voltages of both ends, and what they give; `factors` is the range of the field factor without a lens."""
+def _voltage_constants(voltages, assumed):
+    """Voltages of both ends, and what they give."""
     constants: list[Constant] = []
+    field, lens, factor, factors = assumed.field, assumed.lens, assumed.factor, assumed.factors
     fields = field * (1 + EVAPORATION_FIELD_ERROR), field * (1 - EVAPORATION_FIELD_ERROR)
     for where, part in (("first", voltages[:_ENDS]), ("last", voltages[-_ENDS:])):
         voltage = float(np.median(part))
@@ -308,8 +332,14 @@ def _voltage_constants(voltages, field, lens, factor, factors):
     return constants
 
 
-def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
+def _shank(hits, disc, scale, assumed):
     """Angle of the shank from the history of the voltage."""
+    lens, length, efficiency = assumed.lens, assumed.length, assumed.efficiency
+    of_ions = {
+        "atomic_volume": assumed.volume,
+        "evaporation_field": assumed.field,
+        "detector_radius": disc.radius,
+    }
     name = "angle of the shank [degrees]"
     if hits.x is None or hits.y is None:
         return Constant(name, math.nan, math.nan, "the ions have no places")
@@ -318,10 +348,8 @@ def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
     if lens is not None and length is not None:
         if lens.profile is not None:
             return Constant(name, math.nan, math.nan, "the lens has a profile")
-        known = {"atomic_volume": volume, "distance": length, "evaporation_field": field, "efficiency": efficiency}
-        known["detector_radius"] = disc.radius
         try:
-            fit = fit_shank(placed, lens, **known)
+            fit = fit_shank(placed, lens, distance=length, efficiency=efficiency, **of_ions)
         except ValueError as error:
             return Constant(name, math.nan, math.nan, str(error))
         depth, radius, angle, error = float(np.ptp(fit.depths)), float(fit.radii.mean()), fit.angle, fit.error
@@ -333,9 +361,8 @@ def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
         every = max(1, -(-len(placed) // _IONS))
         # with the flight length and the compression of the map their ratio alone matters
         reconstruction = reconstruct(
-            placed[::every], atomic_volume=volume, distance=scale, compression=1.0,
-            projection="equidistant", field_factor=factor, evaporation_field=field, efficiency=efficiency / every,
-            detector_radius=disc.radius,
+            placed[::every], distance=scale, compression=1.0, projection="equidistant",
+            field_factor=assumed.factor, efficiency=efficiency / every, **of_ions,
         )  # fmt: skip
         parts = np.array_split(np.arange(len(reconstruction)), min(_SECTIONS, len(reconstruction)))
         depths, radii = (
@@ -358,7 +385,7 @@ def _shank(hits, disc, scale, volume, efficiency, field, lens, factor, length):
     return Constant(name, angle, error, f"for an efficiency of {efficiency:g}; {why}")
 
 
-def _halves(measured, candidate, hits, voltages, field, lens):
+def _halves(measured, candidate, hits, voltages, assumed):
     """Scale of the second half of the ions against that of the first one."""
     detected = hits[hits.detected]
     half = len(detected) // 2
@@ -369,9 +396,9 @@ def _halves(measured, candidate, hits, voltages, field, lens):
         _scale_of(part.map(like=measured, position_step=None), candidate) for part in parts
     )
     expected = 1.0
-    if lens is not None:
+    if assumed.lens is not None:
         ends = [float(np.median(half)) for half in np.array_split(voltages, 2)]
-        before, after = (float(lens.compression(float(lens.radius(voltage, field)))) for voltage in ends)
+        before, after = map(assumed.compression, ends)
         expected = before / after
     error = second / first * math.hypot(first_error / first, second_error / second)
     meaning = "the image compression changes during the measurement"

@@ -246,33 +246,15 @@ def _text(indexing, radii, size, lens, factors):
     disc = disc_of(indexing.map)
     x, y = np.meshgrid(*indexing.map.centres)
     reach = np.hypot(x - disc.centre[0], y - disc.centre[1])[disc.map.mask].max()
-    axis = ", ".join(f"{component:.4f}" for component in best.orientation.axis)
-    sure = indexing.reason if indexing.decided else f"NOT DECIDED: {indexing.reason}"
-    others = [f"#   or axis = [{', '.join(f'{component:.4f}' for component in other.orientation.axis)}], "
-              f"rotation = {other.orientation.rotation:.2f}"
-              for other in indexing.candidates[1:] if not indexing.decided]  # fmt: skip
     # V = k_f F R of a free tip, with k_f of 1.0 to 1.2
     volts = material.evaporation_field * size * material.a
     limit = float(np.clip(_MOST_ENERGY * _VOLTAGE / (material.charge_state * volts), *_LIMITS))
-    shank = 3.0 if lens is None else lens.shank_angle
-    shank_why = "assumed, it hardly changes the map of the cap" if lens is None else "that of the lens"
     lines = [
         f"{MARK} {__version__}.",
         comment(f"Measured: {indexing.map.source or 'a map'}"),
         *(() if indexing.decided else ("# NOT DECIDED: axis and rotation are those of the first candidate.",)),
         "",
-        "[tip]",
-        f"material = {material_value(material)}",
-        f"axis = [{axis}]    # at the centre of the map, within {best.angle_error:.1f} degrees by its noise",
-        f"# {sure}",
-        *others,
-        f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
-        f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
-        f"# {_radius_text(material, radii, lens, factors)}",
-        f'shank_length = "{2 * size:g} a"',
-        f"shank_angle = {shank:g}    # degrees: {shank_why}",
-        'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
-        "offset_seed = 1    # no atom on the axis",
+        *_tip_lines(indexing, radii, size, lens, factors),
         "",
         "[simulation]",
         f"ions = {ions:_}    # some layers of the cap",
@@ -307,6 +289,34 @@ def _text(indexing, radii, size, lens, factors):
         "",
     ]
     return "\n".join(lines)
+
+
+def _tip_lines(indexing, radii, size, lens, factors):
+    """The table of the specimen."""
+    best = indexing.best
+    material = best.orientation.material
+    others = [] if indexing.decided else [candidate.orientation for candidate in indexing.candidates[1:]]
+    shank = 3.0 if lens is None else lens.shank_angle
+    shank_why = "assumed, it hardly changes the map of the cap" if lens is None else "that of the lens"
+    return [
+        "[tip]",
+        f"material = {material_value(material)}",
+        f"axis = {_axis_text(best.orientation)}    # at the centre of the map, within {best.angle_error:.1f} degrees "
+        "by its noise",
+        f"# {'' if indexing.decided else 'NOT DECIDED: '}{indexing.reason}",
+        *(f"#   or axis = {_axis_text(other)}, rotation = {other.rotation:.2f}" for other in others),
+        f"rotation = {best.orientation.rotation:.2f}    # of the crystal on the map; the map is not mirrored",
+        f'apex_radius = "{size:g} a"    # simulated: {size * material.a:.1f} nm',
+        f"# {_radius_text(material, radii, lens, factors)}",
+        f'shank_length = "{2 * size:g} a"',
+        f"shank_angle = {shank:g}    # degrees: {shank_why}",
+        'depth = "6 a"    # atoms deeper below the surface are not kept in memory',
+        "offset_seed = 1    # no atom on the axis",
+    ]
+
+
+def _axis_text(orientation):
+    return f"[{', '.join(f'{component:.4f}' for component in orientation.axis)}]"
 
 
 def _radius_text(material, radii, lens, factors):

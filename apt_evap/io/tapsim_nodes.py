@@ -184,27 +184,27 @@ def write_types(
     energies = _energies(activation_energies, [element.name for element in tip.elements])
     blocks = [
         _block(
-            number,
-            name,
-            potential=voltage if name == "Bottom" else 0.0,
-            neumann=name == "Bottom",
-            dirichlet=name in ("Top", "Sides"),
+            ID=number,
+            NAME=name,
+            NEUMANN_BOUNDARY=int(name == "Bottom"),
+            DIRICHLET_BOUNDARY=int(name in ("Top", "Sides")),
+            POTENTIAL=voltage if name == "Bottom" else 0.0,
         )
         for number, name in _BOUNDARIES.items()
     ]
     for k, (element, energy) in enumerate(zip(tip.elements, energies, strict=True)):
         blocks.append(
             _block(
-                _FIRST_ID * (k + 1),
-                "_".join(element.name.split()),
-                epsilon=_EPSILON,
-                removable=True,
-                dirichlet=True,
-                potential=voltage,
-                mass=element.mass,
-                charge=element.charge_state,
-                field=element.evaporation_field * 1e9,
-                energy=float(energy),
+                ID=_FIRST_ID * (k + 1),
+                NAME="_".join(element.name.split()),
+                DIELECTRICITY=_EPSILON,
+                REMOVABLE=1,
+                DIRICHLET_BOUNDARY=1,
+                POTENTIAL=voltage,
+                MASS=element.mass,
+                EVAPORATION_CHARGE_STATE=element.charge_state,
+                EVAPORATION_FIELD_STRENGTH=element.evaporation_field * 1e9,
+                EVAPORATION_ACTIVATION_ENERGY=float(energy),
             )
         )
     with replace_file(path) as file:
@@ -224,34 +224,26 @@ def _energies(energies, names):
     return [check_number(energies[name], f"activation energy of {name}", at_least=0, unit="eV") for name in names]
 
 
-def _block(
-    number,
-    name,
-    *,
-    epsilon=1.0,
-    removable=False,
-    neumann=False,
-    dirichlet=False,
-    potential=0.0,
-    mass=0.0,
-    charge=0,
-    field=0.0,
-    energy=0.0,
-):
-    values = {
-        "ID": number,
-        "NAME": name,
-        "CHARGE_DENSITY": 0.0,
-        "DIELECTRICITY": epsilon,
-        "REMOVABLE": int(removable),
-        "NEUMANN_BOUNDARY": int(neumann),
-        "DIRICHLET_BOUNDARY": int(dirichlet),
-        "POTENTIAL": potential,
-        "MASS": mass,
-        "EVAPORATION_CHARGE_STATE": charge,
-        "EVAPORATION_FIELD_STRENGTH": field,
-        "EVAPORATION_ACTIVATION_ENERGY": energy,
-    }
+_EMPTY = {
+    "ID": 0,
+    "NAME": "",
+    "CHARGE_DENSITY": 0.0,
+    "DIELECTRICITY": 1.0,
+    "REMOVABLE": 0,
+    "NEUMANN_BOUNDARY": 0,
+    "DIRICHLET_BOUNDARY": 0,
+    "POTENTIAL": 0.0,
+    "MASS": 0.0,
+    "EVAPORATION_CHARGE_STATE": 0,
+    "EVAPORATION_FIELD_STRENGTH": 0.0,
+    "EVAPORATION_ACTIVATION_ENERGY": 0.0,
+}
+"""Values of a block, unless it has others."""
+
+
+def _block(**values):
+    """One kind of node, by the names of the values in the file."""
     return "".join(
-        f"{key} = {value if isinstance(value, (int, str)) else format(value, '.8g')}\n" for key, value in values.items()
+        f"{key} = {value if isinstance(value, (int, str)) else format(value, '.8g')}\n"
+        for key, value in (_EMPTY | values).items()
     )

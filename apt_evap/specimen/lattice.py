@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -247,12 +248,23 @@ def _to_specimen(coordinates, orientation, origin):
     )
 
 
+class Lattice(NamedTuple):
+    """A crystal lattice in the specimen."""
+
+    structure: str
+    """One of fcc, bcc, sc, diamond, hcp."""
+    a: float
+    """Lattice constant [nm]."""
+    c: float | None
+    """Height of the hexagonal cell [nm]; None for the ideal one, and for cubic lattices."""
+    orientation: ArrayLike
+    """Rotation from crystal to specimen, shape (3, 3)."""
+    origin: ArrayLike
+    """Position of the first lattice site [nm], shape (3,)."""
+
+
 def lattice_sites_in(
-    structure: str,
-    a: float,
-    c: float | None,
-    orientation: ArrayLike,
-    origin: ArrayLike,
+    lattice: Lattice,
     signed_distance: Callable[[Floats], Floats],
     bounds: ArrayLike,
     *,
@@ -269,12 +281,8 @@ def lattice_sites_in(
 
     Parameters
     ----------
-    structure, a, c
-        As for `cell_lengths`.
-    orientation : array_like
-        Rotation from crystal to specimen, shape (3, 3).
-    origin : array_like
-        Position of the first lattice site [nm], shape (3,).
+    lattice : Lattice
+        The lattice.
     signed_distance : callable
         Takes points (n, 3) [nm], returns (n,) [nm], negative inside. The values at two points must not differ by more
         than the distance between the points.
@@ -298,14 +306,13 @@ def lattice_sites_in(
     labels : ndarray of int32, shape (n,)
         Empty without `label`.
     """
-    edges = cell_lengths(structure, a, c)
-    orientation = check_array(orientation, "orientation", (3, 3))
-    origin = check_array(origin, "origin", (3,))
+    edges = cell_lengths(lattice.structure, lattice.a, lattice.c)
+    orientation = check_array(lattice.orientation, "orientation", (3, 3))
+    origin = check_array(lattice.origin, "origin", (3,))
     bounds = check_array(bounds, "bounds", (2, 3))
-    basis = np.array(BASES[structure], dtype=np.float64)
+    basis = np.array(BASES[lattice.structure], dtype=np.float64)
     # blocks of cells that cover the bounds: indices of the first one, number, and radius of the sphere around one
-    corners = np.array([[x, y, z] for x in bounds[:, 0] for y in bounds[:, 1] for z in bounds[:, 2]])
-    corners = matrix_product(corners - origin, orientation) / edges
+    corners = matrix_product(np.array(list(product(*bounds.T))) - origin, orientation) / edges
     first = np.floor((corners.min(axis=0) - 1) / block).astype(np.int64)
     count = np.ceil((corners.max(axis=0) + 1) / block).astype(np.int64) - first
     reach = 0.5 * block * float(lengths(edges)) + tolerance

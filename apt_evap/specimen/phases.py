@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,16 +151,6 @@ def check_phases(phases: Any) -> tuple[Phase, ...]:
     return phases
 
 
-class Lattice(NamedTuple):
-    """A lattice that one or several phases have in common."""
-
-    structure: str
-    a: float
-    c: float | None
-    orientation: tuple[tuple[float, ...], ...]
-    shift: tuple[float, ...]
-
-
 def _key(element):
     """What makes two materials the same species."""
     return element.name, element.evaporation_field, element.charge_state, element.mass, element.polarizability
@@ -204,7 +194,7 @@ class Arrangement:
         seed: int | None,
     ) -> None:
         self._phases, self._seed = tuple(phases), seed
-        self.lattices: list[Lattice] = []
+        self.lattices: list[lattice.Lattice] = []
         self._lattice_of = []
         species: dict[Any, int] = {}
         elements = []
@@ -225,7 +215,8 @@ class Arrangement:
             if offset is not None:
                 lengths = lattice.cell_lengths(host.structure, host.a, host.c)
                 shift = origin + matrix_product(turned, offset * lengths)
-            cell = Lattice(host.structure, host.a, host.c, tuple(map(tuple, turned.tolist())), tuple(shift.tolist()))
+            orientation = tuple(map(tuple, turned.tolist()))
+            cell = lattice.Lattice(host.structure, host.a, host.c, orientation, tuple(shift.tolist()))
             if cell not in self.lattices:
                 self.lattices.append(cell)
             self._lattice_of.append(self.lattices.index(cell))

@@ -213,7 +213,7 @@ class Tip:
         positions, labels = [], []
         for number, cell in enumerate(lattices):
             points, label = lattice.lattice_sites_in(
-                *cell,
+                cell,
                 shape.signed_distance,
                 shape.bounds,
                 depth=None if depth is None else lambda points: self._shell.depth_at(points) + margin,
@@ -311,13 +311,8 @@ class Tip:
         """
         tip = cls.__new__(cls)
         tip._shell, tip._phase, tip._has_gaps, tip.phases = None, None, False, ()  # type: ignore[assignment]
-        tip.positions = check_array(positions, "positions", ("n", 3))
+        tip.positions = _checked_positions(positions)
         n = len(tip.positions)
-        if n < 2:
-            raise ValueError(f"positions must contain at least 2 atoms, got {n}")
-        farthest = float(np.abs(tip.positions).max())
-        if farthest > _FARTHEST:
-            raise ValueError(f"positions must be at most {_FARTHEST:g} nm from the origin, got {farthest:.4g} nm")
         elements = check_sequence(elements, "elements", "materials, such as ('Ni',)")
         if not elements:
             raise ValueError("elements must contain at least one material, got none")
@@ -568,6 +563,17 @@ def _phases_of(material, solutes, phases):
     if matrix.material in fractions:
         raise ValueError(f"solutes must differ from the material, got {matrix.material.name}")
     return (matrix,)
+
+
+def _checked_positions(positions):
+    """Positions of at least two atoms that are not too far away [nm]."""
+    positions = check_array(positions, "positions", ("n", 3))
+    if len(positions) < 2:
+        raise ValueError(f"positions must contain at least 2 atoms, got {len(positions)}")
+    farthest = float(np.abs(positions).max())
+    if farthest > _FARTHEST:
+        raise ValueError(f"positions must be at most {_FARTHEST:g} nm from the origin, got {farthest:.4g} nm")
+    return positions
 
 
 def _spacing_of(positions):

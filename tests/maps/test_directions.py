@@ -5,7 +5,7 @@ import pytest
 
 from apt_evap import Material, Orientation, material
 from apt_evap.maps.crystallography.directions import direction_normals, label, plane_normals, poles, zones
-from apt_evap.specimen.lattice import lattice_sites_in
+from apt_evap.specimen.lattice import Lattice, lattice_sites_in
 
 OF_STRUCTURE = {
     "fcc": material("Ni"),
@@ -45,7 +45,7 @@ def test_spacings_are_those_of_the_atoms(structure):
         return np.linalg.norm(points, axis=1) - radius
 
     atoms, _ = lattice_sites_in(
-        structure, crystal.a, crystal.c, np.eye(3), (0, 0, 0), ball, [[-radius] * 3, [radius] * 3]
+        Lattice(structure, crystal.a, crystal.c, np.eye(3), (0, 0, 0)), ball, [[-radius] * 3, [radius] * 3]
     )
     found = poles(crystal, 6)
     assert len(found.planes) > 20

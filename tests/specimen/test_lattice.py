@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from apt_evap.specimen.lattice import (
     BASES,
     COORDINATION,
+    Lattice,
     atom_density,
     cell_lengths,
     direction_vectors,
@@ -42,7 +43,9 @@ def uniform(depth):
 
 
 def points_in_ball(structure, radius, axis=(0, 0, 1), origin=(0, 0, 0), **options):
-    return lattice_sites_in(structure, A, None, rotation_to_axis(structure, axis), origin, *ball(radius), **options)[0]
+    return lattice_sites_in(
+        Lattice(structure, A, None, rotation_to_axis(structure, axis), origin), *ball(radius), **options
+    )[0]
 
 
 @pytest.mark.parametrize("structure", BASES)
@@ -53,7 +56,7 @@ def test_shells_of_neighbours_of_every_site(structure, axis, site, shift):
     orientation = rotation_to_axis(structure, axis)
     basis = np.array(BASES[structure])
     centre = orientation @ (basis[site % len(basis)] * cell_lengths(structure, A)) + shift
-    points = lattice_sites_in(structure, A, None, orientation, shift, *ball(reach, centre))[0]
+    points = lattice_sites_in(Lattice(structure, A, None, orientation, shift), *ball(reach, centre))[0]
     distances = np.sort(np.linalg.norm(points - centre, axis=1)) / A
     expected = [0.0] + [math.sqrt(square) for count, square in shells for _ in range(count)]
     np.testing.assert_allclose(distances, expected, atol=1e-12)  # rounding at coordinates of a few a
@@ -69,7 +72,9 @@ def test_nearest_neighbour_distance_and_coordination_agree_with_the_shells(struc
 def test_real_hcp_has_two_shells_of_six():
     titanium = material("Ti")
     orientation = rotation_to_axis(titanium, (0, 0, 1))
-    points = lattice_sites_in("hcp", titanium.a, titanium.c, orientation, (0, 0, 0), *ball(1.02 * titanium.a))[0]
+    points = lattice_sites_in(Lattice("hcp", titanium.a, titanium.c, orientation, (0, 0, 0)), *ball(1.02 * titanium.a))[
+        0
+    ]
     distances = np.sort(np.linalg.norm(points, axis=1))[1:]
     between = math.sqrt(titanium.a**2 / 3 + titanium.c**2 / 4)
     np.testing.assert_allclose(distances, [between] * 6 + [titanium.a] * 6, rtol=1e-12)
@@ -209,6 +214,6 @@ def test_brute_force_gives_the_same_points():
     cells = np.indices((17, 17, 17)).reshape(3, -1).T - 8
     everything = np.concatenate([(cells + site) * A for site in BASES["diamond"]]) @ orientation.T + origin
     expected = everything[np.linalg.norm(everything, axis=1) <= 4 * A]
-    found = lattice_sites_in("diamond", A, None, orientation, origin, *ball(4 * A))[0]
+    found = lattice_sites_in(Lattice("diamond", A, None, orientation, origin), *ball(4 * A))[0]
     assert len(found) == len(expected)
     assert cKDTree(expected).query(found)[0].max() < 1e-12  # rounding only

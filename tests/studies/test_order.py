@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.specimen.lattice import lattice_sites_in
+from apt_evap.specimen.lattice import Lattice, lattice_sites_in
 from apt_evap.studies.visibility.false_order import warren_cowley
 
 A = 0.352  # nm
@@ -14,7 +14,7 @@ A = 0.352  # nm
 def cube():
     """Sites of an fcc cube of 8 cells, and their corner of the cell."""
     sites, _ = lattice_sites_in(
-        "fcc", A, None, np.eye(3), np.zeros(3), lambda points: np.abs(points).max(axis=1) - 4 * A,
+        Lattice("fcc", A, None, np.eye(3), np.zeros(3)), lambda points: np.abs(points).max(axis=1) - 4 * A,
         [[-4 * A] * 3, [4 * A] * 3], tolerance=1e-6,
     )  # fmt: skip
     return sites, np.all(np.isclose(np.mod(sites / A + 0.01, 1), 0.01, atol=1e-3), axis=1)

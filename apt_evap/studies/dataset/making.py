@@ -40,7 +40,7 @@ from apt_evap.studies.dataset.set_description import (
     write_about,
 )
 from apt_evap.studies.dataset.shards import Schema, file_names, write_shard
-from apt_evap.studies.sweep.planning import Sweep, plan_sweep, sweep_status
+from apt_evap.studies.sweep.planning import Sweep, make_plan, sweep_status
 from apt_evap.studies.sweep.point_folder import RUN
 from apt_evap.studies.sweep.sampling import drawn
 from apt_evap.studies.sweep.study_file import Point, SweepStudy, read_study
@@ -160,7 +160,7 @@ def plan_dataset(path: AnyPath) -> PlannedSet:
             raise ValueError(f"a data set must have at most {MOST_EXAMPLES:,} examples, got {examples:,}")
     except (ValueError, ImportError) as error:
         raise FileError(f"{str(path)!r}, [dataset]: {error}") from error
-    sweep = plan_sweep(path)
+    sweep = make_plan(study)
     return PlannedSet(study, sweep, settings, _shards(sweep.points, settings))
 
 

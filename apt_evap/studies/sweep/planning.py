@@ -35,6 +35,7 @@ from apt_evap.studies.sweep.study_file import (
     POINTS,
     JobSettings,
     Point,
+    SweepStudy,
     check_setting_path,
     folder_of_study,
     read_study,
@@ -163,8 +164,12 @@ def plan_sweep(path: AnyPath) -> Sweep:
     FileError
         If the study is wrong, or a file cannot be written.
     """
-    study = read_study(path)
-    folder = folder_of_study(path)
+    return make_plan(read_study(path))
+
+
+def make_plan(study: SweepStudy) -> Sweep:
+    """Plan the sweep of a study that is read already, see `plan_sweep`."""
+    folder = folder_of_study(study.path)
     tables = set()
     for point, config in zip(study.points, study.configs, strict=True):
         if "path" in config.tip and (table := json.dumps(point.document["tip"])) not in tables:

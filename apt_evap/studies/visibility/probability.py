@@ -310,6 +310,7 @@ def estimate_visibility(
     bounds = np.array([0.5, 2.0]) * size if operators is None else operators.axes.get("size", np.array([size]))
     low, high = float(bounds[0]), float(bounds[-1])
     random = np.random.default_rng(seed)
+    test = _Test(analysis, reach, permutations, significance, random)
 
     def twin(number, value):
         values = {"size": value} if math.isfinite(value) else {}
@@ -319,29 +320,16 @@ def estimate_visibility(
             ions = recorded_ions(run, instrument, perturbation, number)
         else:
             ions = operators.emulate(number, instrument.efficiency, **values_of(variant, chosen, operators.axes))
-        return _analysed(variant, ions, analysis, reach, permutations, significance, random)
+        return test.of(variant, ions)
 
     # twins of the feature, and of sizes with equal probabilities per relative change
     drawn = np.exp(random.uniform(math.log(low), math.log(high), twins)) if low < high else np.empty(0)
     nominal = [twin(seed + 1000 + k, size) for k in range(twins)]
     sized = [twin(seed + 1000 + twins + k, value) for k, value in enumerate(drawn)]
+    p_values = np.array([one.p_value for one in nominal])
+    of_sizes = test.sized(drawn, sized) if sized else None
     measured, true = _columns(nominal)
-    return Visibility(
-        size,
-        significance,
-        np.array([one.p_value for one in nominal]),
-        measured,
-        true,
-        SizedTwins(
-            drawn,
-            np.array([one.ions for one in sized]),
-            np.array([one.p_value <= significance for one in sized]),
-            _columns(sized)[0],
-        )
-        if sized
-        else None,
-        operators,
-    )
+    return Visibility(size, significance, p_values, measured, true, of_sizes, operators)
 
 
 def is_simulated_in_full(feature: Phase) -> bool:
@@ -420,23 +408,39 @@ class _Analysed(NamedTuple):
     true: dict[str, float]
 
 
-def _analysed(feature, ions: Ions, analysis, reach, permutations, significance, random) -> _Analysed:
-    """What an analysis finds in the ions of a twin."""
-    solute = _solute(ions)
-    shape, true = apparent_shape(feature, ions, solute)
-    measured = {f"apparent {name}": value for name, value in shape.items()}
-    positions, labels = ions.positions, ions.labels
-    if reach is not None and hasattr(feature.region, "distance"):
-        near = feature.region.distance(positions) <= reach
-        positions, labels = positions[near], labels[near]
-    results = _results(analysis, positions, labels)
-    measured |= {name: value for name, value in results.items() if name != "statistic"}
-    enough = math.floor(significance * (permutations + 1)) + 1
-    p = permutation_p_value(
-        analysis, positions, labels, permutations=permutations, exceedances=max(1, enough), seed=random
-    )
-    known = {name: true[name.removeprefix("apparent ")] for name in measured if name.removeprefix("apparent ") in true}
-    return _Analysed(p, int(ions.inside.sum()), measured, known)
+@dataclass(frozen=True)
+class _Test:
+    """An analysis and its p-value, with the arguments of `estimate_visibility`."""
+
+    analysis: Callable[[Floats, NDArray[np.int64]], Any]
+    reach: float | None
+    permutations: int
+    significance: float
+    random: np.random.Generator
+
+    def of(self, feature: Phase, ions: Ions) -> _Analysed:
+        """What the analysis finds in the ions of a twin."""
+        solute = _solute(ions)
+        shape, true = apparent_shape(feature, ions, solute)
+        measured = {f"apparent {name}": value for name, value in shape.items()}
+        positions, labels = ions.positions, ions.labels
+        if self.reach is not None and hasattr(feature.region, "distance"):
+            near = feature.region.distance(positions) <= self.reach
+            positions, labels = positions[near], labels[near]
+        results = _results(self.analysis, positions, labels)
+        measured |= {name: value for name, value in results.items() if name != "statistic"}
+        enough = max(1, math.floor(self.significance * (self.permutations + 1)) + 1)
+        p = permutation_p_value(
+            self.analysis, positions, labels, permutations=self.permutations, exceedances=enough, seed=self.random
+        )
+        plain = {name: name.removeprefix("apparent ") for name in measured}
+        known = {name: true[quantity] for name, quantity in plain.items() if quantity in true}
+        return _Analysed(p, int(ions.inside.sum()), measured, known)
+
+    def sized(self, sizes: Floats, twins: list[_Analysed]) -> SizedTwins:
+        """Twins with different sizes."""
+        is_found = np.array([twin.p_value <= self.significance for twin in twins])
+        return SizedTwins(sizes, np.array([twin.ions for twin in twins]), is_found, _columns(twins)[0])
 
 
 def apparent_shape(feature: Phase, ions: Ions, solute: int) -> tuple[dict[str, float], dict[str, float]]:

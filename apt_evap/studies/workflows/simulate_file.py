@@ -153,14 +153,7 @@ def simulate(
     >>> len(done.run), done.path.name, done.picture.name
     (100, 'tiny.h5', 'tiny.png')
     """
-    settings = check_path(settings)
-    document = read_document(settings)
-    changes = {name: value for name, value in {"ions": ions, "seed": seed}.items() if value is not None}
-    if isinstance(table := document.get("simulation", {}), dict):  # config_of refuses anything else
-        document["simulation"] = table | changes
-    config = config_of(document, settings, own_classes=True)
-    if "responses" in document and not config.responses:
-        warn("the table [responses] is not used: [simulation] has responses = false", WorkflowWarning)
+    config = _config(check_path(settings), ions=ions, seed=seed)
     path = check_path(output or config.output or f"{config.path.stem}.h5")
     if path.suffix.lower() != ".h5":
         raise FileError(f"a run is saved in an HDF5 file with the suffix .h5, got {str(path)!r}")
@@ -203,6 +196,17 @@ def simulate(
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
     note(f"wrote {picture}")
     return Simulated(run, path, picture, maps, titles, seconds)
+
+
+def _config(settings: Path, **changes: int | None) -> Config:
+    """Settings of a file, with changed values of the table [simulation] unless they are None."""
+    document = read_document(settings)
+    if isinstance(table := document.get("simulation", {}), dict):  # config_of refuses anything else
+        document["simulation"] = table | {name: value for name, value in changes.items() if value is not None}
+    config = config_of(document, settings, own_classes=True)
+    if "responses" in document and not config.responses:
+        warn("the table [responses] is not used: [simulation] has responses = false", WorkflowWarning)
+    return config
 
 
 def _evaporated(config: Config, simulation: Simulation, stored: Checkpoint, n_previous: int, progress: Any) -> Run:
