@@ -60,6 +60,7 @@ generate.settings(GENERATED / "settings.inc")
 generate.materials(GENERATED / "materials.inc")
 generate.atlas(GENERATED / "atlas.html")
 generate.dataset_fields(GENERATED / "dataset_fields.inc")
+generate.thumbnails(GENERATED / "thumbnails")
 
 # examples write files to the folder where they run: run copies, not the originals
 shutil.copytree(HERE.parent / "examples", GENERATED / "scripts", dirs_exist_ok=True)
