@@ -1,5 +1,6 @@
 """Sphinx: `sphinx-build -W docs docs/_build` in an environment with `pip install '.[docs]'`."""
 
+import html
 import re
 import shutil
 import sys
@@ -7,6 +8,8 @@ import warnings
 from pathlib import Path
 
 import matplotlib
+import ziamath
+from docutils.nodes import SkipNode
 
 import apt_evap
 
@@ -24,7 +27,6 @@ release = version = apt_evap.__version__
 extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "numpydoc",
     "sphinx_copybutton",
     "sphinx_design",
@@ -58,6 +60,7 @@ generate.settings(GENERATED / "settings.inc")
 generate.materials(GENERATED / "materials.inc")
 generate.atlas(GENERATED / "atlas.html")
 generate.dataset_fields(GENERATED / "dataset_fields.inc")
+generate.thumbnails(GENERATED / "thumbnails")
 
 # examples write files to the folder where they run: run copies, not the originals
 shutil.copytree(HERE.parent / "examples", GENERATED / "scripts", dirs_exist_ok=True)
@@ -79,6 +82,7 @@ copybutton_prompt_text = "$ "
 copybutton_exclude = ".linenos, .gp"
 
 html_theme = "pydata_sphinx_theme"
+html_math_renderer = "pictures"  # below: no script, and nothing from a network
 html_title = f"apt_evap {version}"
 html_logo = "_static/logo.svg"
 html_favicon = "_static/favicon.svg"
@@ -112,5 +116,29 @@ def in_package(app, env, node, contnode):
     return None
 
 
+ziamath.config.svg2 = False  # every picture has its own letters
+
+
+def formula(text, inline):
+    """Formula as an SVG in the colour of the text, on its line."""
+    drawn = ziamath.Latex(" ".join(text.split()), size=17, color="currentColor", inline=inline)  # px
+    attributes = f'role="img" aria-label="{html.escape(text)}" style="vertical-align: {drawn.getyofst():.2f}px"'
+    return drawn.svg().replace("<svg ", f"<svg {attributes} ", 1)
+
+
+def inline_formula(self, node):
+    """Draw a formula in a line."""
+    self.body.append(formula(node.astext(), True))
+    raise SkipNode
+
+
+def displayed_formula(self, node):
+    """Draw formulas between paragraphs; empty lines separate them."""
+    for text in filter(str.strip, node.astext().split("\n\n")):
+        self.body.append(f'<div class="formula">{formula(text, False)}</div>\n')
+    raise SkipNode
+
+
 def setup(app):
+    app.add_html_math_renderer("pictures", (inline_formula, None), (displayed_formula, None))
     app.connect("missing-reference", in_package)

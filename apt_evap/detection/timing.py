@@ -85,7 +85,7 @@ class Cooling:
     -----
     With the temperature T(t) after the peak, ions leave with the density
 
-    .. math:: p(t) \propto \exp\left(-\frac{Q}{k} \Big(\frac{1}{T(t)} - \frac{1}{T_\mathrm{peak}}\Big)\right) .
+    .. math:: p(t) \propto \exp\left(-\frac{Q}{k} \Bigl(\frac{1}{T(t)} - \frac{1}{T_\mathrm{peak}}\Bigr)\right) .
 
     The rate long after the pulse is subtracted: its ions are those between the pulses. The decay "exponential" is
     :math:`T_0 + \Delta T e^{-t/\tau}`, "conduction" :math:`T_0 + \Delta T/\sqrt{1 + t/\tau}`: the solution of the heat

@@ -250,7 +250,7 @@ class Study:
     def to_dict(self) -> dict[str, Any]:
         """Return results and settings in plain types, NaN as None, dict."""
         names = ("scores", "errors", "shares", "gain_share", "optimum", "refined", "registration", "gain", "ceiling")
-        names += ("baselines", "plain", "real_energies", "likeness", "no_energy", "no_score", "result")
+        names += ("baselines", "plain", "real_energies", "likeness", "no_energy", "no_score", "energy", "result")
         results = to_plain({name: getattr(self, name) for name in names})
         results["made_by"] = f"apt_evap {__version__}"
         results["grid"] = to_plain(self.grid) | {"mechanism": self.grid.name}
@@ -327,18 +327,23 @@ class Study:
         return real["real_per_study"], f"at {real['operating_field']:.3g} V/nm and {real['flight_charge']}+"
 
     @property
+    def energy(self) -> str:
+        """Mean energy after the truncation at the field of the experiment [eV], with its interval; empty if none."""
+        return "" if self.no_energy else self.refined.scaled("true_mean", self.real_factor[0])
+
+    @property
     def result(self) -> str:
         """The result as one sentence: how the ions leave, and their mean energy or the reason why it is not given.
 
         The mean is that after the truncation, at the field of the experiment if it is known.
         """
-        refined, (factor, where) = self.refined, self.real_factor
+        refined, (_, where) = self.refined, self.real_factor
         if self.no_energy:
             return f"no energy is given: {self.no_energy}"
         material = self.provenance["run"]["tip"].get("material")
         name = material.get("name") if isinstance(material, dict) else material
         ions = f"{name} ions" if isinstance(name, str) else "ions"
-        energy = f"a mean of {refined.scaled('true_mean', factor)} eV {where}"
+        energy = f"a mean of {self.energy} eV {where}"
         mechanism = self.grid.mechanism
         if mechanism == "roll-up":
             text = f"{ions} roll up with {energy}"

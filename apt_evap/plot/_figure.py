@@ -72,9 +72,13 @@ def set_caption(ax: Axes, text: str) -> None:
 
 def ion_label(element: str, charge: int, mass_number: int | None = None) -> str:
     """Return the label of an ion with its charge, such as Ni with a raised 2+, and of an isotope with its number."""
-    element = element.replace("$", r"\$")
-    sign = "{+}" if charge == 1 else f"{charge}{{+}}"  # braces: no space, as of a sum
-    return ("" if mass_number is None else f"$^{{{mass_number}}}$") + f"{element}$^{{{sign}}}$"
+    isotope = "" if mass_number is None else f"$^{{{mass_number}}}$"
+    return isotope + element.replace("$", r"\$") + raised_charge(charge)
+
+
+def raised_charge(charge: int) -> str:
+    """Return a charge such as 2+ as a superscript; braces instead of a space, as of a sum."""
+    return f"$^{{{'' if charge == 1 else charge}{{+}}}}$"
 
 
 def set_log_ticks(axis: Axis, least_range: float = 1.0) -> None:

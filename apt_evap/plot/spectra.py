@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_spectrum import Spectrum
-from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure
+from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
 
@@ -148,9 +148,8 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits):
             continue
         top, place = max(tops)
         places.append(place)
-        charge = f"{peak.charge}{{+}}" if peak.charge > 1 else "{+}"
         ax.annotate(
-            f"{_subscripts(peak.formula)}$^{{{charge}}}$", (place, max(top, 1)), xytext=(0, 4),
+            _subscripts(peak.formula) + raised_charge(peak.charge), (place, max(top, 1)), xytext=(0, 4),
             textcoords="offset points", ha="center", va="bottom", color=color, annotation_clip=True,
         )  # fmt: skip
     bottom, top = ax.get_ylim()

@@ -277,3 +277,19 @@ def test_in_a_browser_without_network(page):
 def test_a_study_is_a_folded_table_in_a_notebook(study):
     shown = study._repr_html_()
     assert shown.startswith("<details>") and str(study.optimum.score) in shown and study.lines()[0][:20] in shown
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
+def test_the_report_of_the_default_objective(small_tip, tmp_path):
+    """A map with a pole is compared after folding, and the report has the name and the numbers of this score."""
+    run = ae.Simulation(small_tip, seed=1, **ROUGH).run(1500, progress=False)
+    measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
+    here = ae.Registration(0.0, 1.0, (0.0, 0.0))
+    energies = {"means": (0.1, 0.2, 0.3), "relative_spreads": (0.5,)}
+    study = fit_energies(run, measured, registration=here, replicas=1, resamples=3, progress=False, **energies)
+    assert study.settings.objective == "folded"
+    study.__dict__["likeness"] = study.likeness._replace(verdict="alike", reason="")
+    ae.plot.write_study(study, tmp_path / "report.html")
+    text = Reader((tmp_path / "report.html").read_text()).text
+    assert f"concordance {study.plain['optimum']}" in text or f"concordance {study.optimum.score}" in text
+    assert "SSIM" not in text

@@ -19,11 +19,13 @@ def rows(study):
     better["optimum"]["score"] = {"value": 1.97654, "error": None}
     better["refined"]["intervals"] = {}
     better["registration"]["doubtful"] = True
-    better["no_energy"] = "the errors are not known"
+    better["no_energy"], better["energy"] = "the errors are not known", ""
     unrelated = json.loads(json.dumps(content))
     unrelated["optimum"]["score"] = {"value": 2.55555, "error": None}
     unrelated["likeness"]["verdict"], unrelated["no_energy"] = "not alike", "the maps are not alike"
-    content["refined"]["open_ends"], content["no_energy"] = {}, ""
+    unrelated["energy"], content["no_energy"] = "", ""
+    refined, factor = study.refined, study.provenance["real_units"]["real_per_study"]
+    content["energy"] = bounded_text(refined.true_mean, refined.intervals["true_mean"], None, factor)
     maps = {"measured": study.measured, "best": study.maps["optimum"]}
     return [
         SweepRow("3f9c", {"tip.axis": [1, 1, 1], "tip.apex_radius": "20 a"}, {"ions": 15000}, content),

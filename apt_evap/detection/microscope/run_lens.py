@@ -226,7 +226,7 @@ class RunLens:
         .. math::
 
            t = t_\mathrm{lens} \left( 1 + \frac{V_\mathrm{model}}{V}
-               \Big( \frac{t_\mathrm{simulated}}{t_\mathrm{free}} - 1 \Big) \right) .
+               \Bigl( \frac{t_\mathrm{simulated}}{t_\mathrm{free}} - 1 \Bigr) \right) .
         """
         lengths = np.hypot(*directions.T)
         free = np.degrees(2 * np.arctan(lengths))

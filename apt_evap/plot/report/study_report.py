@@ -101,12 +101,9 @@ def write_study(
 
 def _sentence(study):
     """The verdict and the result."""
-    verdict, reason = study.likeness.verdict, study.likeness.reason
-    if verdict == "alike":
-        return f"The maps are alike{', but' if study.no_energy else ':'} {study.result}."
-    whether = "It is doubtful that the maps are alike" if verdict == "doubtful" else "The maps are not alike"
-    known = " The registration is doubtful." if study.registration.doubtful else ""
-    return f"{whether}, so no energy is given: {reason}.{known}"
+    text = study.lines()[0]
+    known = study.likeness.verdict == "alike" or not study.registration.doubtful
+    return f"{text[0].upper()}{text[1:]}." + ("" if known else " The registration is doubtful.")
 
 
 def doubts(content: Mapping[str, Any]) -> list[str]:

@@ -12,7 +12,6 @@ from apt_evap._common.codec import for_json, from_plain
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.fit.fit_settings import FitSettings
-from apt_evap.fit.study import bounded_text
 from apt_evap.plot.map_figures import default_smoothing
 from apt_evap.plot.report.html_page import Markup, Page, escape, heading, paragraph, switched, table, text_of
 from apt_evap.plot.report.origin import add_origin, origin
@@ -217,22 +216,15 @@ def _study_cells(row):
     content, score, alike = row.study, row.score, row.alike
     if content is None:
         return [""] * (1 + len(_STUDY))
-    refined = content["refined"]
     error = f" ± {score['error']:.3f}" if score["error"] is not None else ""
     text = f"{score['value']:.3f}{error}" + ("" if row.is_corrected else ", not corrected for noise")
-    real = content["settings"]["real_units"]
-    factor = 1.0 if real is None else real["real_per_study"]
-    energy = bounded_text(
-        refined["true_mean"], refined["intervals"].get("true_mean"), refined["open_ends"].get("true_mean"), factor
-    )
     reasons = [
         Markup(f'<span class="red">{escape(content["likeness"]["verdict"])}</span>') if not alike else "",
         Markup('<span class="red">registration doubtful</span>') if content["registration"]["doubtful"] else "",
         content["no_energy"] if alike else "",
         "end of the grid" if content["optimum"]["at_edge"] and alike else "",
     ]
-    shown = "" if content["no_energy"] else energy
-    return [text if alike else "", shown, Markup(", ".join(escape(reason) for reason in reasons if reason))]
+    return [text if alike else "", content["energy"], Markup(", ".join(escape(reason) for reason in reasons if reason))]
 
 
 def _names(parts):
