@@ -40,7 +40,8 @@ class DisplayPanel:
         sliders = self.smoothing, self.flattening, self.bins
         for slider in sliders:
             request_maps_of(slider, request)
-        self.widgets: list[Any] = [*map(slider_with_number, sliders)]
+        self.widgets: list[Any] = [slider_with_number(self.smoothing)]
+        self.further: list[Any] = [*map(slider_with_number, (self.bins, self.flattening))]
 
     def reset(self) -> None:
         """Set the numbers of the start."""

@@ -8,7 +8,9 @@ from bokeh.models import RadioButtonGroup, Slider
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.explore.controls import CONTROLS, MECHANISMS, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer
-from apt_evap.explore.widgets import LEFT, request_maps_of, slider_with_number
+from apt_evap.explore.widgets import LEFT, group, request_maps_of, slider_with_number
+
+_FURTHER = ("sharpness", "height", "others")  # sliders that few move
 
 
 class EmissionPanel:
@@ -47,7 +49,10 @@ class EmissionPanel:
             request_maps_of(slider, request)
         self.mechanism.on_change("active", lambda attr, old, new: self._mechanism_changed())
         self._show_sliders()
-        self.widgets: list[Any] = [self.mechanism, *map(slider_with_number, self.sliders.values())]
+        first = [slider_with_number(slider) for name, slider in self.sliders.items() if name not in _FURTHER]
+        further = [slider_with_number(slider) for name, slider in self.sliders.items() if name in _FURTHER]
+        self.widgets: list[Any] = [self.mechanism, *first]
+        self.widgets += [group("more", further, active=False)] if further else []
 
     @property
     def perturbation(self) -> Perturbation:

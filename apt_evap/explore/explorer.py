@@ -21,10 +21,11 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.explore.marks import Overlay, overlay
 from apt_evap.explore.placement import misplaced
 from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.fit_energies import BINS, measured_map
-from apt_evap.fit.structure import PoleMeasure
+from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
 from apt_evap.maps.crystallography.directions import poles
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import pole_symmetry
@@ -41,6 +42,7 @@ PREVIEW = 50_000
 REGION = RollUp(TruncatedNormal(0.155, 0.155))
 """Second perturbation, beside none, whose map limits the common region: energies of Shaikh et al. (2025) for nickel."""
 _PERTURBATIONS = 2  # whose positions are kept: one may be that of a preview
+_FAMILIES = 6  # of poles over the maps
 _NEAR = 15.0  # degrees: a pole farther from the axis of the specimen is not that of its apex
 
 
@@ -520,6 +522,22 @@ class Explorer:
         if self.registration is not None:
             x, y = self.registration.points(x, y)
         return Pole(text, (float(x), float(y)), fold)
+
+    def poles_over(self, maps: ExplorerMaps) -> Overlay | None:
+        """Poles and zone lines of the specimen on the maps, None without a crystal or with too few ions."""
+        orientation = Orientation.known(self.run.settings["tip"])
+        if orientation is None:
+            return None
+        try:
+            projection = self._projection
+        except ValueError:  # too few ions
+            return None
+        if self.registration is not None:
+            projection = RegisteredProjection(projection, self.registration)
+        like = maps.pictures[-1] if maps.whole is None else maps.whole
+        drawn = overlay(orientation, projection, like, _FAMILIES)
+        inside = np.flatnonzero(like.contains(*drawn.places.T))
+        return drawn._replace(places=drawn.places[inside], labels=tuple(drawn.labels[k] for k in inside))
 
     def rings(self, maps: ExplorerMaps) -> tuple[tuple[Ring, ...], ...]:
         """Statistics of rings about the pole, of the simulated and of the measured map.

@@ -28,6 +28,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.mouse_tools import MouseTool
 from apt_evap.explore.newest_task import NewestTaskRunner
+from apt_evap.explore.pole_panel import draw_poles, with_gaps
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
@@ -143,22 +144,7 @@ class IndexPanel:
         self.poles = ColumnDataSource({"x": [], "y": [], "x0": [], "y0": [], "label": []})
         self.handles = ColumnDataSource({"x": [], "y": []})
         self.marks = ColumnDataSource({"x": [], "y": [], "family": [], "line": []})
-        fig.line("x", "y", source=self.lines, line_color="#35b6ff", line_width=1, line_alpha=0.8)
-        fig.scatter("x", "y", source=self.poles, size=7, fill_alpha=0, line_color="white")
-        shadow = {"background_fill_color": "black", "background_fill_alpha": 0.5}
-        fig.add_layout(
-            LabelSet(
-                x="x",
-                y="y",
-                text="label",
-                source=self.poles,
-                x_offset=4,
-                y_offset=3,
-                text_color="white",
-                text_font_size="10px",
-                **shadow,
-            )
-        )
+        self._drawings = draw_poles(fig, self.lines, self.poles)
         drawn = fig.scatter("x", "y", source=self.marks, size=13, marker="cross", line_color="lime", line_width=3)
         fig.add_layout(
             LabelSet(
@@ -174,14 +160,20 @@ class IndexPanel:
             )
         )
         held = fig.scatter("x", "y", source=self.handles, size=14, line_color="black", fill_color="orange")
-        fig.line("x", "y", source=self.handles, line_color="orange", line_dash="dotted")
+        between = fig.line("x", "y", source=self.handles, line_color="orange", line_dash="dotted")
         follow = {"handles": self.handles, "lines": self.lines, "poles": self.poles}
         self.handles.js_on_change("change", CustomJS(args=follow, code=_FOLLOW))
         self.handles.on_change("data", lambda attr, old, new: self._dragged())
         self.tool = PointDrawTool(renderers=[drawn, held], add=False)
         fig.add_tools(self.tool)
+        self._drawings += [held, between]
         self.marks.on_change("data", lambda attr, old, new: self.fit())
         self._line = 1
+
+    def show_overlay(self, shown: bool) -> None:
+        """Show or hide the candidate on the map; the marks stay."""
+        for drawing in self._drawings:
+            drawing.visible = shown
 
     # ---- marks -----------------------------------------------------------------------------------------------------
 
@@ -336,9 +328,7 @@ class IndexPanel:
             return
         orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
         drawn = overlay(orientation, projection, measured_map(self._measured()))
-        gap = [[np.nan, np.nan]]
-        points = np.concatenate([points for line in drawn.lines for points in (line, gap)] or [gap])
-        self.lines.data = _twice(points)
+        self.lines.data = _twice(with_gaps(drawn.lines))
         self.poles.data = _twice(drawn.places) | {"label": list(drawn.labels)}
         self._put_handles(projection)
         axis = ", ".join(f"{component:.3f}" for component in orientation.axis)

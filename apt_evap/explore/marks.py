@@ -1,6 +1,7 @@
 """Poles and zone lines that a user marks on a map, and the orientations that fit them."""
 
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 from apt_evap._common.types import Floats
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.fit.structure import RegisteredProjection
 from apt_evap.maps.crystallography.directions import members_of_families, poles, zones
 from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation, fit_orientation
 from apt_evap.specimen.materials import as_material
@@ -28,7 +30,7 @@ class Overlay(NamedTuple):
     places: Floats
     """Positions of the poles [mm], shape (n, 2)."""
     labels: tuple[str, ...]
-    """Indices of the poles, with a minus before a negative one."""
+    """Indices of the poles, with a bar over a negative one."""
     lines: tuple[Floats, ...]
     """Points of each zone line [mm], shape (m, 2), NaN outside the map."""
 
@@ -159,14 +161,19 @@ class Marks:
         return projection.scale * math.sqrt(np.mean(squares)), tuple(members), tuple(lines)
 
 
-def overlay(orientation: Orientation, projection: Projection, like: DetectorMap, families: int = FAMILIES) -> Overlay:
+def overlay(
+    orientation: Orientation,
+    projection: Projection | RegisteredProjection,
+    like: DetectorMap,
+    families: int = FAMILIES,
+) -> Overlay:
     """Poles and zone lines of an orientation on a map.
 
     Parameters
     ----------
     orientation : Orientation
         Orientation of the crystal.
-    projection : Projection
+    projection : Projection or RegisteredProjection
         Projection onto the map.
     like : DetectorMap
         The map.
@@ -199,10 +206,9 @@ def overlay(orientation: Orientation, projection: Projection, like: DetectorMap,
 
 
 def plain(label: str) -> str:
-    """Label of a pole without the math syntax of matplotlib."""
-    for math_text, text in (("$", ""), (r"\bar{", "-"), ("}", ""), (r"\,", " ")):
-        label = label.replace(math_text, text)
-    return label
+    """Label of a pole without the math syntax of matplotlib, with bars over negative indices."""
+    label = re.sub(r"\\bar\{(\d+)\}", lambda match: "".join(f"{digit}\u0305" for digit in match[1]), label)
+    return label.replace("$", "").replace(r"\,", " ")
 
 
 def _frame(first, second):

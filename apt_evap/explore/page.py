@@ -8,7 +8,7 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import Button, CustomJS, Div, GlobalInlineStyleSheet, Widget
+from bokeh.models import Button, CustomJS, GlobalInlineStyleSheet, Widget
 
 from apt_evap.explore.code_panel import CodePanel
 from apt_evap.explore.display_panel import DisplayPanel
@@ -20,6 +20,7 @@ from apt_evap.explore.ion_panel import IonPanel
 from apt_evap.explore.map_views import MapFigures
 from apt_evap.explore.mouse_tools import MouseTools
 from apt_evap.explore.newest_task import NewestTaskRunner
+from apt_evap.explore.pole_panel import PolePanel
 from apt_evap.explore.profile_panel import ProfilePanel
 from apt_evap.explore.registration_panel import RegistrationPanel
 from apt_evap.explore.rings_panel import RingsPanel
@@ -28,7 +29,7 @@ from apt_evap.explore.search_process import guarded
 from apt_evap.explore.specimen_panel import SpecimenPanel
 from apt_evap.explore.style import STYLES, WIDGETS, page_styles, theme
 from apt_evap.explore.summary_panel import SummaryPanel
-from apt_evap.explore.widgets import LEFT, grid, group, save_button
+from apt_evap.explore.widgets import LEFT, Tabs, group, maps_and_tabs, save_button
 from apt_evap.maps.registration.register import Registration
 from apt_evap.specimen.materials import MATERIALS
 
@@ -122,6 +123,7 @@ class Page:
         self.emission: EmissionPanel | None = None
         self.ions: IonPanel | None = None
         self.specimen: SpecimenPanel | None = None
+        self.poles: PolePanel | None = None
         self.rings: RingsPanel | None = None
         tools = {"line": self.profile.tool, "box": self.code.tool}
         if explorer.run is not None:
@@ -129,8 +131,9 @@ class Page:
             self.ions = IonPanel(explorer, maps.settings.ions, request)
             self.specimen = SpecimenPanel(explorer, maps, figures)
             self.rings = RingsPanel(explorer, self._later)
+            self.poles = PolePanel(explorer, maps, figures)
             tools = {"atoms": self.specimen.tool} | tools
-            self._panels += [self.specimen, self.rings]
+            self._panels += [self.specimen, self.rings, self.poles]
         if explorer.measured is not None:
             self.index = IndexPanel(
                 figures, lambda: explorer.measured, self._material(), self._later, self.code.put_python
@@ -147,6 +150,15 @@ class Page:
             )
             self._panels.append(self.registration)
         self.tools = MouseTools(figures, tools, self.figures.show_whole)
+        if explorer.is_comparison:
+            self.tools.choice.on_change("active", lambda attr, old, new: self._show_candidate())
+            self._show_candidate()
+
+    def _show_candidate(self):
+        """Poles of the candidate while the map is indexed, else those of the run."""
+        indexed = self.tools.choice.labels[self.tools.choice.active] in self.index.tools
+        self.index.show_overlay(indexed)
+        self.poles.hide_on_last(indexed)
 
     def _material(self):
         """Name of the crystal of the run, if it is one of the table."""
@@ -159,26 +171,25 @@ class Page:
     # ---- layout ----------------------------------------------------------------------------------------------------
 
     def _head(self):
-        status = Div() if self.registration is None else self.registration.status
         return row(
-            self.files.field, self.summary.facts, status, self.summary.readout, self.style,
-            sizing_mode="stretch_width", styles={"align-items": "center", "gap": "8px"},
+            self.files.field, self.summary.facts, self.style,
+            sizing_mode="stretch_width", styles={"align-items": "center", "gap": "12px"},
         )  # fmt: skip
 
     def _left(self):
-        has_run = self.explorer.run is not None
         figures = self.figures
+        has_run, more = self.explorer.run is not None, group("more", self.display.further, active=False)
         display = [figures.mode, row(figures.same_scale, save_button(figures.figures))]
-        display += [*self.display.widgets, *self.profile.widgets]
+        display += [*self.display.widgets, more]
         groups = []
         if self.emission is not None:
             groups.append(group("emission", self.emission.widgets, self.emission.reset))
-        groups.append(group("display", display, self._reset_display))
-        if self.ions is not None and self.specimen is not None:
-            groups.append(group("ions", [self.ions.slider, *self.specimen.widgets], self.ions.reset))
         if self.index is not None and self.simulation is not None:
-            groups.append(group("index", [self.index.column], active=not has_run))
+            groups.append(group("crystal", [self.index.column], active=not has_run))
             groups.append(group("simulate", [self.simulation.column], active=not has_run))
+        if self.ions is not None:
+            groups.append(group("ions of the run", [self.ions.slider], self.ions.reset))
+        groups.append(group("display", display, self._reset_display))
         if self.registration is not None:
             groups.append(group("registration", self.registration.widgets, active=False))
         if self.rings is not None:
@@ -186,13 +197,19 @@ class Page:
         return column(*groups, width=LEFT)
 
     def _right(self):
-        parts: list[Any] = [column(fig, sizing_mode="stretch_width") for fig in self.figures.figures]
-        profile = self.profile.figure
-        if self.specimen is not None:
-            specimen = self.specimen
-            profile = column(specimen.view.figure, specimen.row, profile, sizing_mode="stretch_width")
-        code = group("code", self.code.widgets, active=False)
-        return column(self.tools.row, grid([*parts, profile]), code, sizing_mode="stretch_width")
+        contents: dict[str, Any] = {} if self.specimen is None else {"specimen": self.specimen.widgets}
+        contents |= {"profile": self.profile.widgets, "code": self.code.widgets}
+        tools = [self.tools.row] if self.poles is None else [self.tools.row, self.poles.button]
+        self.tabs = Tabs(contents)
+        verdict = []
+        if self.registration is not None:
+            verdict = [row(self.registration.status, self.summary.readout, sizing_mode="stretch_width")]
+        elif self.explorer.run is not None:
+            verdict = [self.summary.readout]
+        return column(
+            row(*tools, sizing_mode="stretch_width"), *verdict,
+            maps_and_tabs(self.figures.figures, self.tabs.column), sizing_mode="stretch_width",
+        )  # fmt: skip
 
     def _add_root(self):
         """Style the page, and add it to the document."""

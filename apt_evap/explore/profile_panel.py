@@ -1,10 +1,11 @@
 """Panel of profiles across a line that is drawn on the maps."""
 
 from collections.abc import Callable, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FreehandDrawTool, Slider
+from bokeh.models import ColumnDataSource, Div, FreehandDrawTool, Slider
 from bokeh.plotting import figure
 
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
@@ -13,6 +14,7 @@ from apt_evap.explore.widgets import slider_with_number
 from apt_evap.maps.zone_line import fit_zone_line
 from apt_evap.warnings import AptWarning
 
+_HINT = "Draw a line on a map with the mouse tool “line”: the profile across it."
 _COLORS = {"simulated": "#4aa3ff", "measured": "#ffb04a"}
 
 
@@ -41,7 +43,7 @@ class ProfilePanel:
         names: Sequence[str],
         note: Callable[[str], None],
     ) -> None:
-        self._explorer, self._maps, self._note = explorer, maps, note
+        self._explorer, self._maps, self._note, self._names = explorer, maps, note, names
         self.line = ColumnDataSource({"xs": [], "ys": []})
         self.rectangle = ColumnDataSource({"x": [], "y": []})
         drags = []
@@ -57,19 +59,20 @@ class ProfilePanel:
             title="width of a profile [mm]", start=0.0, end=longer / 2, step=maps.bin_size, value=longer / 6
         )
         self.width.on_change("value", lambda attr, old, new: self._put_profiles())
-        self.widgets: list[Any] = [slider_with_number(self.width)]
+        self.text = Div(text=_HINT, sizing_mode="stretch_width")
         self.figure: Any = figure(
-            title="profile: draw a line on a map (mode “line”)",
             sizing_mode="stretch_width",
-            height=230,
+            height=260,
             tools="pan,wheel_zoom",
             toolbar_location=None,
             x_axis_label="distance from the line [mm]",
             y_axis_label="density",
+            visible=False,
         )
         self.curves = [ColumnDataSource({"x": [], "y": []}) for _ in names]
         for source, name in zip(self.curves, names, strict=True):
-            self.figure.line("x", "y", source=source, legend_label=name, line_width=2, line_color=_COLORS[name])
+            self.figure.line("x", "y", source=source, line_width=2, line_color=_COLORS[name])
+        self.widgets: list[Any] = [self.text, self.figure, slider_with_number(self.width)]
 
     def put(self, maps: ExplorerMaps) -> None:
         """Show the profiles of maps, unless they are a preview."""
@@ -98,11 +101,13 @@ class ProfilePanel:
             return
         corners = rectangle.corners
         self.rectangle.data = {"x": corners[:, 0], "y": corners[:, 1]}
+        self.figure.visible = True
         lines = []
-        for source, profile in zip(self.curves, profiles, strict=True):
+        for name, source, profile in zip(self._names, self.curves, profiles, strict=True):
             source.data = {"x": profile.position, "y": profile.density}
             try:
-                lines.append(str(fit_zone_line(profile)))
+                told = str(fit_zone_line(profile))
             except (ValueError, AptWarning):
-                lines.append("no line")
-        self.figure.title.text = "\n".join(lines)
+                told = "no line"
+            lines.append(f'<b style="color: {_COLORS[name]}">{name}</b> {escape(told)}')
+        self.text.text = "<br>".join(lines)

@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from html import escape
 from typing import Any
 
 from bokeh.layouts import row
@@ -16,8 +15,6 @@ from apt_evap.explore.search_process import SearchProcess, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.registration.verdict import Likeness
-
-_VERDICT_COLORS = {"alike": "#2e7d4f", "doubtful": "#a8741a", "not alike": "#a93a3a"}
 
 
 class _SearchStoppedError(Exception):
@@ -62,7 +59,6 @@ class RegistrationPanel:
         self._progress: tuple[int, int] | None = None
         self._progress_text = ""
         self._maps: ExplorerMaps | None = None
-        self._judged_registration: Any = None
         self.likeness: Any = None
         """The last verdict."""
         self.status = Div()
@@ -168,29 +164,18 @@ class RegistrationPanel:
 
     def _put_likeness(self, maps, likeness):
         if maps is self._maps:
-            self.likeness, self._judged_registration = likeness, self._explorer.registration
+            self.likeness = likeness
             self._judged(maps, likeness)
-            self._put_status()
 
     def _put_status(self):
-        """Show the state of the search, and the verdict."""
+        """Show the state of the search."""
         parts = []
         if self._progress is not None:
             done, of = self._progress
             parts.append(
-                f'<progress value="{done}" max="{of}" style="width: 120px"></progress><br>'
+                f'<progress value="{done}" max="{of}" style="width: 120px"></progress> '
                 f"<small>registering, {self._progress_text}</small>"
             )
-        registration = self._explorer.registration
-        is_judged = self.likeness is not None and self._judged_registration is registration
-        if self._explorer.registered and registration is not None and is_judged:
-            text, reason = self.likeness.verdict, self.likeness.reason
-            if registration.doubtful:
-                reason += f"; the correlation of the registered maps is only {registration.score:.2f}"
-            parts.append(
-                f'<span title="{escape(reason)}" style="background: {_VERDICT_COLORS[text]}; color: white;'
-                f' border-radius: 10px; padding: 3px 10px; white-space: nowrap">{text}</span>'
-            )
-        elif self._progress is None and not self._explorer.registered:
+        elif not self._explorer.registered:
             parts.append("<small>not registered</small>")
-        self.status.text = "<br>".join(parts)
+        self.status.text = " ".join(parts)

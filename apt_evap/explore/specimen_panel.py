@@ -40,14 +40,14 @@ class SpecimenPanel:
         self.radius = Slider(
             title="radius of a click [mm]", start=0.0, end=maps.width / 10, step=size / 4, value=2 * size
         )
-        self.widgets: list[Any] = [slider_with_number(self.radius)]
         has_phases = len(self._explorer.run.phase_names) > 1
         colors = {name: title for name, title in COLORED_BY.items() if name != "phase" or has_phases}
         self.color = Select(title="atoms coloured by", value="order", options=[*colors.items()], width=190)
         self.color.on_change("value", lambda attr, old, new: self._put_surface())
         self.side = RadioButtonGroup(labels=[*SIDES], active=None)
         self.side.on_change("active", lambda attr, old, new: self._side_changed())
-        self.row = row(self.color, self.side)
+        choices = row(self.color, self.side, styles={"flex-wrap": "wrap", "align-items": "end"})
+        self.widgets: list[Any] = [self.view.figure, choices, slider_with_number(self.radius)]
         self._put_surface()
 
     def put(self, maps: ExplorerMaps) -> None:

@@ -19,6 +19,7 @@ WIDGETS = """
 .bk-btn-default:hover, .bk-btn-default:disabled { background-color: var(--edge); color: var(--ink); }
 .bk-btn-default.bk-active, .bk-btn.bk-active { background-color: #2f6fb3; color: #ffffff; }
 .bk-btn { padding: 4px 8px; }
+small { font-size: 12px; color: var(--faint); }
 .noUi-target { background-color: var(--edge); }
 .noUi-connect { background-color: #2f6fb3; }
 :host(.number) .bk-input { height: 26px; padding: 2px 6px; }
@@ -26,6 +27,9 @@ WIDGETS = """
   text-align: left; font-weight: 600; }
 :host(.group) .bk-btn::before { content: "\\25b8  "; }
 :host(.group) .bk-btn.bk-active::before { content: "\\25be  "; }
+:host(.tabs) .bk-btn { background: transparent; color: var(--ink); border-width: 0 0 3px 0; border-radius: 0;
+  border-color: var(--edge); padding: 6px 14px; }
+:host(.tabs) .bk-btn.bk-active { background: transparent; color: var(--ink); border-color: #2f6fb3; font-weight: 600; }
 pre { white-space: pre-wrap; color: var(--ink); }
 table { border-spacing: 8px 0; }
 """
@@ -43,6 +47,7 @@ def theme(style: str) -> Theme:
     """Theme of the figures."""
     c = _COLORS[style]
     text = {"axis_label_text_color": c["ink"], "major_label_text_color": c["ink"]}
+    sizes = {"axis_label_text_font_size": "13px", "major_label_text_font_size": "12px"}
     lines = dict.fromkeys(("major_tick_line_color", "minor_tick_line_color", "axis_line_color"), c["faint"])
     return Theme(
         json={
@@ -53,17 +58,20 @@ def theme(style: str) -> Theme:
                     "outline_line_color": c["edge"],
                 },
                 "Grid": {"grid_line_color": c["edge"]},
-                "Axis": text | lines | {"axis_label_text_font_style": "normal"},
-                "Title": {"text_color": c["ink"]},
+                "Axis": text | lines | sizes | {"axis_label_text_font_style": "normal"},
+                "Title": {"text_color": c["ink"], "text_font_size": "14px"},
                 "ColorBar": {
                     "background_fill_color": c["paper"],
                     "title_text_color": c["ink"],
+                    "title_text_font_size": "12px",
+                    "major_label_text_font_size": "12px",
                     "major_label_text_color": c["ink"],
                     "title_text_font_style": "normal",
                 },
                 "Legend": {
                     "background_fill_color": c["panel"],
                     "label_text_color": c["ink"],
+                    "label_text_font_size": "12px",
                     "border_line_color": c["edge"],
                 },
             }

@@ -12,6 +12,8 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.maps.registration.verdict import Likeness
 
+_COLORS = {"alike": "#2e7d4f", "doubtful": "#a8741a", "not alike": "#a93a3a"}
+
 READOUT_DELAY = 60
 """Delay of the numbers of a preview [ms]: a text changes the layout, which takes as long as to paint a map (50 ms)."""
 
@@ -31,12 +33,12 @@ class SummaryPanel:
         self._later = later
         self._maps: ExplorerMaps | None = None
         self._explorer = explorer
-        self._judged: tuple[Any, str] = (None, "")  # registration and verdict of the last maps that were judged
+        self._judged: tuple[Any, Any] = (None, None)  # registration and verdict of the last maps that were judged
         self._readout_waits = False
         facts = ["<b>apt-evap explore</b>"] if explorer is None else _facts(explorer)
         self.facts = Div(text=" &nbsp; ".join(facts), sizing_mode="stretch_width")
-        self.readout = Div(width=330)
-        self.notes = Div(sizing_mode="stretch_width", styles={"color": "#d9822b"})
+        self.readout = Div(sizing_mode="stretch_width")
+        self.notes = Div(sizing_mode="stretch_width", styles={"color": "#d9822b"}, visible=False)
 
     def put(self, maps: ExplorerMaps) -> None:
         """Show the numbers and the notes of maps, those of a preview a little later."""
@@ -50,7 +52,7 @@ class SummaryPanel:
     def judge(self, maps: ExplorerMaps, likeness: Likeness) -> None:
         """Take the verdict on maps: the similarity is a number for maps that are alike."""
         if self._explorer is not None:
-            self._judged = self._explorer.registration, likeness.verdict
+            self._judged = self._explorer.registration, likeness
         if maps is self._maps:
             self._put_numbers(maps)
 
@@ -64,24 +66,34 @@ class SummaryPanel:
             self._put_numbers(self._maps)
 
     def _put_numbers(self, maps):
-        text = ""
-        registration, verdict = self._judged
-        if self._explorer is None or registration is not self._explorer.registration:
-            verdict = ""  # of another registration
-        if maps.similarity is not None:
-            text = f"no similarity: the maps are {verdict}<br>" if verdict else ""
-        if maps.similarity is not None and verdict == "alike":
-            halves = "" if maps.ceiling is None else f"; of two halves of the measurement {maps.ceiling.value:.3f}"
-            text = f'<span style="font-size: 26px">{maps.similarity.value:.3f}</span> similarity{halves}<br>'
         ions = "" if maps.simulated is None else f"{maps.simulated.shown_ions} on the map"
         if maps.preview:
             ions += ", preview"
         tone = "var(--faint)" if maps.preview else "var(--ink)"
-        self.readout.text = f'<div style="color: {tone}">{text}<small>{ions}</small></div>'
+        self.readout.text = f'<div style="color: {tone}">{self._sentence(maps)} <small>{ions}</small></div>'
         self._put_notes(maps.notes)
 
+    def _sentence(self, maps):
+        """The verdict on both maps, with one number: the similarity of maps that are alike."""
+        registration, likeness = self._judged
+        if maps.similarity is None or likeness is None or self._explorer is None:
+            return ""
+        if registration is not self._explorer.registration:
+            return ""  # of another registration
+        sentence = likeness.reason
+        if likeness.verdict == "alike":
+            sentence = f"the maps have a similarity of {maps.similarity.value:.2f}"
+            if maps.ceiling is not None:
+                sentence += f"; two halves of the measurement have {maps.ceiling.value:.2f}"
+        elif registration.doubtful:
+            sentence += f"; the correlation of the registered maps is only {registration.score:.2f}"
+        return (
+            f'<b title="{escape(likeness.reason)}" style="background: {_COLORS[likeness.verdict]}; color: white;'
+            f' border-radius: 10px; padding: 2px 10px; white-space: nowrap">{likeness.verdict}</b> {escape(sentence)}'
+        )
+
     def _put_notes(self, notes: Sequence[str]) -> None:
-        self.notes.text = "<br>".join(map(escape, notes))
+        self.notes.update(text="<br>".join(map(escape, notes)), visible=bool(notes))
 
 
 def _facts(explorer):

@@ -4,13 +4,30 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from bokeh.layouts import column, row
-from bokeh.models import Button, ColorBar, CustomJS, Range1d, Slider, Spinner, Toggle
+from bokeh.models import (
+    Button,
+    ColorBar,
+    CustomJS,
+    InlineStyleSheet,
+    RadioButtonGroup,
+    Range1d,
+    Slider,
+    Spinner,
+    Toggle,
+)
 from bokeh.plotting import figure
 
 LEFT = 300
 """Width of the controls [px]."""
-NARROWEST = 320
-"""Least width of a map [px]: two of them stand side by side on a screen of 1000 px."""
+_NARROWEST = 290  # px, of a map: two of them stand side by side in a window of 1000 px
+_ABOVE = 120  # px of the window above and below a map
+_RATIO = 0.9  # width over height of a map, with its axes and colour bar
+# one map has the tabs beside it, two maps only in a wide window
+_WORK = """
+:host { display: grid; grid-template-columns: minmax(0, 1fr); gap: 12px; align-items: start; }
+@media (min-width: 1150px) { :host(.one) { grid-template-columns: minmax(0, 1.4fr) minmax(360px, 1fr); } }
+@media (min-width: 1600px) { :host(.two) { grid-template-columns: minmax(0, 1fr) 420px; } }
+"""
 
 # the frame of a figure is seldom square: the longer direction shows more, so that both have the same scale
 _KEEP_SQUARE = """
@@ -42,18 +59,20 @@ def square(title: str, extent: Sequence[float], tools: Sequence[Any], **options:
     fig = figure(
         title=title,
         sizing_mode="scale_width",
-        aspect_ratio=0.9,
-        min_width=NARROWEST - 30,
+        aspect_ratio=_RATIO,
+        min_width=_NARROWEST,
+        styles={"max-width": f"calc({_RATIO} * max(300px, 100vh - {_ABOVE}px))"},
         tools=list(tools),
         toolbar_location=None,
         **({"x_range": Range1d(), "y_range": Range1d()} | options),
     )
     fig.grid.visible = False
     show_extent(fig, extent)
-    keep = CustomJS(args={"fig": fig}, code=_KEEP_SQUARE)
-    for name in ("inner_width", "inner_height"):
-        fig.js_on_change(name, keep)
-    fig.x_range.js_on_change("tags", keep)
+    if "x_range" not in options:  # else the figure that it shares its ranges with sets them, for both
+        keep = CustomJS(args={"fig": fig}, code=_KEEP_SQUARE)
+        for name in ("inner_width", "inner_height"):
+            fig.js_on_change(name, keep)
+        fig.x_range.js_on_change("tags", keep)
     return fig
 
 
@@ -122,18 +141,43 @@ def group(title: str, children: Sequence[Any], reset: Callable[[], None] | None 
     return column(row(*top, sizing_mode="stretch_width"), inside, sizing_mode="stretch_width")
 
 
-def grid(children: Sequence[Any]) -> Any:
-    """As many columns as the window has place for."""
+def maps_and_tabs(maps: Sequence[Any], tabs: Any) -> Any:
+    """Maps side by side as large as the window allows, with tabs beside or below them."""
+    columns = {"display": "grid", "grid-template-columns": f"repeat({len(maps)}, minmax(0, 1fr))", "gap": "6px"}
+    pair = column(*maps, sizing_mode="stretch_width", styles=columns)
+    name = "one" if len(maps) == 1 else "two"
     return column(
-        *children,
-        sizing_mode="stretch_width",
-        styles={
-            "display": "grid",
-            "grid-template-columns": f"repeat(auto-fit, minmax({NARROWEST}px, 1fr))",
-            "gap": "6px",
-            "align-items": "start",
-        },
+        pair, tabs, sizing_mode="stretch_width", css_classes=[name], stylesheets=[InlineStyleSheet(css=_WORK)]
     )
+
+
+class Tabs:
+    """Widgets of which one is shown, below a row of titles.
+
+    Bokeh's own tabs do not draw the figures in them where their place has the width of a grid.
+
+    Parameters
+    ----------
+    contents : dict of str to sequence
+        Widgets by title; the first ones are shown at the start.
+    """
+
+    def __init__(self, contents: dict[str, Sequence[Any]]) -> None:
+        self.titles = list(contents)
+        self.choice = RadioButtonGroup(labels=self.titles, active=0, css_classes=["tabs"])
+        self._places = [
+            column(*parts, sizing_mode="stretch_width", visible=number == 0)
+            for number, parts in enumerate(contents.values())
+        ]
+        show = "places.forEach((place, k) => { place.visible = k == choice.active })"
+        self.choice.js_on_change("active", CustomJS(args={"places": self._places, "choice": self.choice}, code=show))
+        self.column = column(self.choice, *self._places, sizing_mode="stretch_width")
+
+    def show(self, title: str) -> None:
+        """Show the widgets of a title."""
+        self.choice.active = self.titles.index(title)
+        for number, place in enumerate(self._places):
+            place.visible = number == self.choice.active
 
 
 def copy_button(label: str, text: Any) -> Button:

@@ -105,7 +105,7 @@ def drag(page, start, end):
 
 def test_the_page_is_driven(page, served):
     # keys move a slider, the map and what is written
-    page.wait_for_function("written().includes('similarity')")
+    page.wait_for_function("/alike|doubtful/.test(written())")
     picture(page, "1_start")
     before, text = page.evaluate("mean()"), page.evaluate("written()")
     pixels = page.screenshot()
@@ -162,7 +162,7 @@ def test_the_page_is_driven(page, served):
     # two clicks index the map
     page.get_by_text("pole", exact=True).click()
     page.wait_for_function("maps[1].toolbar.active_drag.type == 'PointDrawTool'")
-    page.get_by_text("index", exact=True).click()
+    page.get_by_text("crystal", exact=True).first.click()
     for each in ((0.4, 0.5), (0.6, 0.5)):
         page.mouse.click(*place(page, 1, *each))
         page.wait_for_timeout(600)  # not a double click
@@ -176,6 +176,30 @@ def test_the_page_is_driven(page, served):
     assert all(each.replace("ws://", "http://").startswith(start) for each in page.requests), page.requests
     if folder := os.environ.get("APT_EVAP_SCREENSHOTS"):
         Path(folder, "requests.txt").write_text("\n".join(page.requests))
+
+
+@pytest.mark.parametrize("width", [1000, 1280, 1440, 1920])
+def test_maps_fill_the_window(page, width):
+    """Two maps side by side, as wide as the window allows, and nothing beyond its edge."""
+    page.set_viewport_size({"width": width, "height": width * 5 // 8})
+    page.wait_for_timeout(1500)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    boxes = [page.evaluate(f"area({number})") for number in (0, 1)]
+    assert boxes[0][1] == pytest.approx(boxes[1][1], abs=2)  # side by side
+    assert boxes[0][2] == pytest.approx(boxes[1][2], abs=2) and boxes[0][2] > (400 if width >= 1280 else 250)
+    sizes = page.evaluate("""() => {
+      const sizes = []
+      const visit = root => root.querySelectorAll("*").forEach(e => {
+        if (e.shadowRoot) visit(e.shadowRoot)
+        const text = [...e.childNodes].some(n => n.nodeType == 3 && n.textContent.trim())
+        if (text && !["STYLE", "SCRIPT"].includes(e.tagName) && e.getBoundingClientRect().width)
+          sizes.push([parseFloat(getComputedStyle(e).fontSize), e.textContent.trim().slice(0, 30)])
+      })
+      visit(document)
+      return sizes
+    }""")
+    assert len(sizes) > 10 and min(sizes)[0] >= 12, min(sizes)
+    picture(page, f"window_{width}")
 
 
 def test_only_the_address_opens_the_page(served):

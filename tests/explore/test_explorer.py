@@ -1,5 +1,6 @@
 """The numbers of the explorer: the same bits as those of the library, and text that gives them again."""
 
+import math
 import re
 import shlex
 import sys
@@ -269,6 +270,22 @@ def test_rings_about_the_pole(run20):
         assert one.contrast == pytest.approx(other.contrast, rel=1e-9)  # the same ions
         # other bins: within the noise of the counts
         assert one.contrast == pytest.approx(moved.contrast, abs=4 * (one.error + moved.error))
+
+
+def test_poles_over_the_maps(run20):
+    """They lie where the registration puts the run, and only on the detector."""
+    run = replace(run20, perturbations=(), flown=())
+    hits = TURNED.hits(run.hits(ae.Unperturbed()))
+    explorer = Explorer(run, ae.Hits(x=hits.x, y=hits.y).within_circle(30.0, TURNED.shift), TURNED)
+    settings = ExplorerSettings(ae.Unperturbed(), 64, 2.0)
+    drawn, alone = explorer.poles_over(explorer.show(settings)), Explorer(run).poles_over(Explorer(run).show(settings))
+    on_detector = dict(zip(alone.labels, alone.places, strict=True))
+    assert len(drawn.labels) >= 7 and drawn.labels[0] == "111"
+    for label, place in zip(drawn.labels, drawn.places, strict=True):
+        assert place == pytest.approx(np.array(TURNED.points(*on_detector[label])))
+        assert math.hypot(*(place - TURNED.shift)) < 31.0
+    bare = replace(run, settings={**run.settings, "tip": {"source": "a file"}})
+    assert Explorer(bare).poles_over(Explorer(bare).show(settings)) is None
 
 
 @pytest.mark.parametrize(("axis", "label", "fold"), [((0, 0, 1), "$002$", 4), ((0, 1, 1), "$022$", 2)])

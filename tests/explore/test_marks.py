@@ -121,3 +121,7 @@ def test_the_overlay_is_on_the_map():
     for line in drawn.lines:
         points = PROJECTION.directions(line[np.isfinite(line[:, 0])])
         assert np.abs(points @ axes.T).max(axis=0).min() < 1e-9
+
+
+def test_negative_indices_have_bars():
+    assert plain(r"$\bar{1}1\bar{3}$") == "1\u030513\u0305" and plain(r"$\bar{10}\,11$") == "1\u03050\u0305 11"
