@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -65,6 +66,11 @@ class BuildCore(build_ext):
         super().finalize_options()
         if sys.platform == "win32" and self.compiler is None and shutil.which("gcc"):
             self.compiler = "mingw32"
+
+    def get_libraries(self, ext):
+        """Link with the library of all Pythons for the limited API, of which setuptools knows nothing on Windows."""
+        libraries = super().get_libraries(ext)
+        return [re.sub(r"^python3\d+$", "python3", name) for name in libraries] if ABI3 else libraries
 
     def build_extensions(self):
         """Probe for OpenMP, with a serial build and one warning if there is none; leave out debug symbols."""

@@ -168,7 +168,11 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
 
 def open_regular(path: AnyPath, flags: int) -> int:
     """Open a regular file as `os.open` does; OSError for folders, pipes and devices."""
-    descriptor = os.open(path, flags | _WAIT_FOR_NOBODY, 0o666)
+    try:
+        descriptor = os.open(path, flags | _WAIT_FOR_NOBODY, 0o666)
+    except PermissionError:
+        check_regular(os.stat(path))  # Windows opens no folders, and says no more
+        raise
     try:
         check_regular(os.fstat(descriptor))
     except OSError:

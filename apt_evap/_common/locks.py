@@ -1,5 +1,6 @@
 """Locks against other processes, which the system releases when a process ends."""
 
+import errno
 import os
 import socket
 import time
@@ -20,6 +21,7 @@ except ImportError:  # Windows
 
 _OWNER = "process "  # first word of a lock file
 _LOCKED_BYTE = 1 << 20  # behind the text: nobody can read a locked byte on Windows
+_LOCKED_BY_ANOTHER = (errno.EAGAIN, errno.EACCES, 0)  # Linux and macOS, Windows, Windows by Wine
 _PAUSE = 0.2  # seconds between two tries
 
 
@@ -49,7 +51,9 @@ def try_lock(descriptor: int, shared: bool = False) -> bool:
             msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
         else:
             fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):
+    except OSError as error:
+        if error.errno not in _LOCKED_BY_ANOTHER:
+            raise
         return False
     return True
 

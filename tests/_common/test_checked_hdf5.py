@@ -8,6 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from systems import PIPES
 
 import apt_evap as ae
 from apt_evap._common.checked_hdf5 import label_of, open_hdf5, put_field, put_text, write_hdf5
@@ -155,11 +156,16 @@ def test_other_files_are_none(path, tmp_path):
     assert is_run(path)
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file.attrs["format"] = "apt_evap run 1"
-    os.mkfifo(tmp_path / "pipe.h5")
     (tmp_path / "text.h5").write_text("apt_evap run 1")
-    for name in ("other.h5", "pipe.h5", "text.h5", "missing.h5", "."):
+    for name in ("other.h5", "text.h5", "missing.h5", "."):
         assert not is_run(tmp_path / name)
     refused(tmp_path / "other.h5", "is not a run")
+
+
+@PIPES
+def test_a_pipe_is_none(tmp_path):
+    os.mkfifo(tmp_path / "pipe.h5")
+    assert not is_run(tmp_path / "pipe.h5")
 
 
 def test_a_run_of_another_format(path):

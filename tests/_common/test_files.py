@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from systems import LINKS, MODES, PIPES
 
 import apt_evap as ae
 from apt_evap._common.files import FileError, open_for_reading, read_small_file, replace_file
@@ -24,6 +25,7 @@ def write(path, content=b"new"):
 # ---- reading -------------------------------------------------------------------------------------------------------
 
 
+@PIPES
 @pytest.mark.parametrize("name", ["a.epos", "a.pos", "a.apt", "a.raw", "a.rrng", "a.npz", "a.h5"])
 def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
     os.mkfifo(tmp_path / name)
@@ -32,13 +34,17 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name):
         reader(tmp_path / name)
 
 
-def test_folders_and_links_to_regular_files(tmp_path):
+def test_a_folder_is_refused(tmp_path):
+    with pytest.raises(FileError, match=r"Is a directory"), open_for_reading(tmp_path):
+        pass
+
+
+@LINKS
+def test_links_to_regular_files(tmp_path):
     (tmp_path / "a").write_bytes(b"content")
     (tmp_path / "link").symlink_to("a")
     with open_for_reading(tmp_path / "link") as file:
         assert file.read() == b"content"
-    with pytest.raises(FileError, match=r"Is a directory"), open_for_reading(tmp_path):
-        pass
 
 
 def test_the_size_of_a_small_file_is_bounded(tmp_path):
@@ -79,6 +85,7 @@ def test_two_threads_and_one_file(tmp_path):
     assert failed == [] and names(tmp_path) == ["o.pos"]
 
 
+@MODES
 @pytest.mark.parametrize("mode", [0o664, 0o600, 0o444])
 def test_an_overwritten_file_keeps_its_mode(tmp_path, mode):
     path = tmp_path / "o.pos"
@@ -94,6 +101,8 @@ def test_a_new_file_has_the_usual_mode(tmp_path):
     assert (tmp_path / "new").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
+@PIPES
+@LINKS
 def test_outputs_that_are_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "file").write_bytes(b"old")
@@ -113,6 +122,7 @@ def test_outputs_that_are_refused(tmp_path):
     assert names(tmp_path) == before
 
 
+@LINKS
 def test_long_names_and_links(tmp_path):
     name = "n" * 250
     write(tmp_path / name)

@@ -14,6 +14,7 @@ import pytest
 from fits import fit_energies
 from matplotlib.image import imread
 from rough import ROUGH
+from systems import MODES, PIPES
 
 import apt_evap as ae
 from apt_evap._common.codec import for_json
@@ -61,6 +62,7 @@ def failed(capsys, *arguments):
     return err
 
 
+@MODES
 @NO_PICTURES
 def test_files_that_are_overwritten_keep_their_modes(folder):
     arguments = ["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE, "--quiet"]
@@ -71,6 +73,7 @@ def test_files_that_are_overwritten_keep_their_modes(folder):
     assert {path.stat().st_mode & 0o777 for path in (folder / "study").iterdir()} == {0o640}
 
 
+@PIPES
 def test_a_pipe_is_no_registration_and_no_study(folder, capsys):
     os.mkfifo("pipe.json")
     err = failed(capsys, "run.h5", "map.npz", *QUICK, "--registration", "pipe.json")

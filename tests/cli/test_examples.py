@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from systems import PIPES
 
 from apt_evap.cli import examples
 from apt_evap.cli.main import main
@@ -51,14 +52,18 @@ def test_changed_files_are_kept(folder, capsys):
     assert {path.name: path.read_bytes() for path in Path("here").iterdir()} == originals()
 
 
-def test_what_is_refused(folder, capsys, monkeypatch):
-    Path("file").touch()
-    assert main(["examples", "--to", "file"]) == 2
-    assert "cannot write to 'file': File exists" in capsys.readouterr().err
+@PIPES
+def test_a_pipe_is_refused(folder, capsys):
     Path("pipes").mkdir()
     os.mkfifo("pipes/ni111.toml")
     assert main(["examples", "--to", "pipes"]) == 2
     assert "Not a regular file" in capsys.readouterr().err and os.listdir("pipes") == ["ni111.toml"]
+
+
+def test_what_is_refused(folder, capsys, monkeypatch):
+    Path("file").touch()
+    assert main(["examples", "--to", "file"]) == 2
+    assert "cannot write to 'file': File exists" in capsys.readouterr().err
     monkeypatch.setattr(examples, "_PLACES", (folder / "none",))
     assert main(["examples"]) == 2
     assert "the examples are not in" in capsys.readouterr().err

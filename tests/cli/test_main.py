@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import termios
 import time
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from systems import MODES, PIPES, TERMINAL
 
 from apt_evap import __version__, cli, plot
 from apt_evap.cli import _progress
@@ -359,8 +359,11 @@ def test_a_run_that_misses_the_detector_says_so(folder, capsys):
     assert int(re.search(note, capsys.readouterr().err)[1]) > 30
 
 
+@TERMINAL
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
+    import termios
+
     terminal, end = os.openpty()
     termios.tcsetwinsize(end, (24, 100))
     (folder / "small.toml").write_text(SMALL.replace("6 a", "8 a"))
@@ -733,6 +736,7 @@ def test_a_selection_too_small_for_a_map_names_the_option(mixed, capsys):
     assert "'one.epos' has 3 ions at one place on the detector" in failed(capsys, "map", "one.epos")
 
 
+@MODES
 def test_files_that_cannot_be_read_are_not_said_to_be_somebody_elses(capsys, monkeypatch):
     """Of a run that another user may not read, --force would not be the advice."""
     with tempfile.TemporaryDirectory() as name:  # not pytest's, which nobody else may enter
@@ -741,6 +745,7 @@ def test_files_that_cannot_be_read_are_not_said_to_be_somebody_elses(capsys, mon
         Path("small.toml").write_text(SMALL)
         Path("q.h5").write_bytes(b"a run")
         os.chmod("q.h5", 0)
+        failed(capsys, "run", "small.toml", "-o", "q.h5")  # imports what the other user may not read
         user = os.geteuid()
         if user == 0:
             os.seteuid(65534)  # root may read everything
@@ -750,6 +755,7 @@ def test_files_that_cannot_be_read_are_not_said_to_be_somebody_elses(capsys, mon
             os.seteuid(user)
 
 
+@PIPES
 @pytest.mark.parametrize("name", ["pipe.h5", "pipe.png"])
 def test_an_output_that_is_no_regular_file_is_refused(folder, capsys, name):
     os.mkfifo(name)

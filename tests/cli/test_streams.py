@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from systems import SHELL
 
 from apt_evap import cli
 from apt_evap.detection.hits import Hits
@@ -29,28 +30,32 @@ def folder(tmp_path):
 
 def shell(folder, redirection, *arguments, **environment):
     """Run the program with its streams redirected as a shell writes it; its code, stdout and stderr."""
+    shell = ["sh", "-c", f'exec "$@" {redirection}', "sh"] if redirection else []
     done = subprocess.run(
-        ["sh", "-c", f'exec "$@" {redirection}', "sh", sys.executable, "-c", PROGRAM, *arguments],
+        [*shell, sys.executable, "-c", PROGRAM, *arguments],
         cwd=folder,
         capture_output=True,
         env=os.environ | {"PYTHONPATH": HERE} | environment,
         timeout=120,
     )
-    return done.returncode, done.stdout.decode(), done.stderr.decode()
+    return done.returncode, *(stream.decode().replace(os.linesep, "\n") for stream in (done.stdout, done.stderr))
 
 
+@SHELL
 def test_a_run_without_stderr(folder):
     code, out, _ = shell(folder, "2>&-", "run", "small.toml")
     assert code == 0 and out.endswith("wrote small.h5\nwrote small.png\n")
     assert sorted(os.listdir(folder)) == ["ions.epos", "small.h5", "small.png", "small.toml"]
 
 
+@SHELL
 @pytest.mark.parametrize("arguments", [("info", "ions.epos"), ("map", "ions.epos"), ("--version",)], ids=" ".join)
 def test_commands_without_stdout(folder, arguments):
     assert shell(folder, "<&- >&- 2>&-" if arguments[0] == "map" else ">&-", *arguments) == (0, "", "")
     assert (folder / "ions_map.png").exists() == (arguments[0] == "map")
 
 
+@SHELL
 def test_an_error_does_not_go_to_stdout_for_want_of_stderr(folder):
     assert shell(folder, "2>&-", "info", "none.epos") == (2, "", "")
 

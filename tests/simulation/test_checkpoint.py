@@ -16,6 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from systems import FORK, LINKS, MODES, PIPES
 from tqdm.auto import tqdm
 
 import apt_evap as ae
@@ -23,7 +24,6 @@ from apt_evap._common.locks import FileLock
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or not
-KILLABLE = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 
 
 class Processes:
@@ -34,7 +34,7 @@ class Processes:
             [sys.executable, "-P", __file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": HERE},
+            env=os.environ | {"PYTHONPATH": os.pathsep.join((HERE, str(Path(__file__).parents[1])))},
         )
 
     def run(self, function, *arguments, kill_after=None):
@@ -113,7 +113,7 @@ def work(path):
     )
 
 
-@KILLABLE
+@FORK
 @pytest.mark.parametrize("n_kills", [3, pytest.param(20, marks=pytest.mark.slow)])
 def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, processes, n_kills):
     """SIGKILL at random moments; whenever the run comes to its end before, another one begins."""
@@ -160,7 +160,7 @@ def crash(path, number, late):
     run_small(path, resume=True)
 
 
-@KILLABLE
+@FORK
 @pytest.mark.parametrize("late", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_killed_at_every_rename(tmp_path, processes, late):
     run_small(tmp_path / "uninterrupted.h5")
@@ -268,8 +268,10 @@ def test_a_full_disk_loses_nothing(tmp_path):
     assert differing(tmp_path / "run.h5", tmp_path / "saved.h5") == []
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+@MODES
 def test_a_read_only_folder_is_refused_before_the_run(tmp_path):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
     (tmp_path / "folder").mkdir(mode=0o500)
     with pytest.raises(ae.FileError, match=r"cannot write .*run\.h5.*Permission denied"):
         run_small(tmp_path / "folder" / "run.h5")
@@ -296,7 +298,7 @@ def hold(path):
     lock.release()
 
 
-@KILLABLE
+@FORK
 def test_one_process_at_a_time(tmp_path, processes):
     path = tmp_path / "run.h5"
     threading.Thread(target=processes.run, args=(hold, path), kwargs={"kill_after": 5}).start()
@@ -468,7 +470,9 @@ def test_settings_that_are_refused(options, message):
 
 
 @pytest.mark.parametrize("name", ["run.h5.lock", "run.h5.unfinished"])
-@pytest.mark.parametrize("kind", ["link", "folder", "pipe", "text"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("link", marks=LINKS), "folder", pytest.param("pipe", marks=PIPES), "text"]
+)
 def test_only_files_of_this_program_are_replaced(tmp_path, name, kind):
     place, victim = tmp_path / name, tmp_path / "victim.txt"
     victim.write_text("precious")
@@ -484,6 +488,7 @@ def test_only_files_of_this_program_are_replaced(tmp_path, name, kind):
     assert kind != "text" or place.read_text() == "precious"
 
 
+@PIPES
 def test_an_output_that_is_a_pipe_is_refused_before_the_run(tmp_path):
     os.mkfifo(tmp_path / "run.h5")
     with pytest.raises(ae.FileError, match="Not a regular file"):
@@ -491,6 +496,7 @@ def test_an_output_that_is_a_pipe_is_refused_before_the_run(tmp_path):
     assert [item.name for item in tmp_path.iterdir()] == ["run.h5"]
 
 
+@MODES
 def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
     run_small(tmp_path / "run.h5")
     (tmp_path / "run.h5").chmod(0o640)
