@@ -11,6 +11,7 @@ line towards {01-13} and beside it. The gain is a line over the charge ratio, fr
 import argparse
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,14 @@ from apt_evap.maps.crystallography.directions import poles
 
 AXES = AXES | {"Mg": ((0, 0, 0, 1), 20.0)}  # and half the opening angle of the flights [degrees]
 PARTS = (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
+# amplitudes of larger tips over those of R = 80 a, by the rule of the metal (../three_metals)
+LARGER = {
+    "W": {
+        160: np.array([0.92, 0.97, 1.23]) / [1.31, 1.49, 1.75],
+        230: np.array([0.69, 0.77, 1.03]) / [1.31, 1.49, 1.75],
+    },
+    "Ni": {160: np.array([1.18, 0.81, 0.98]) / [1.46, 1.09, 1.24]},
+}
 ENERGIES = (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5)  # eV
 
 
@@ -88,21 +97,18 @@ def simulated(metal, radius, skip, ions, threads):
 
 
 def rules(metal, line, scale):
-    """Rules by name."""
+    """Rules: kind, the number that is varied, and the emission."""
     rule = ae.RollUp.of_metal(metal, energy_scale=scale)
-    found = {"rule of the metal": rule}
+    yield "rule of the metal", 1.0, rule
     for part in PARTS:
-        found[f"eta G, {part:g}"] = ByGain(metal, line, part, scale)
+        yield "eta G", part, ByGain(metal, line, part, scale)
     for part in PARTS:
-        found[f"eta G, {part:g}, atoms by G"] = ByGain(metal, line, part, scale, by_gain=True)
+        yield "eta G, atoms by G", part, ByGain(metal, line, part, scale, by_gain=True)
     for part in (0.02, 0.05, 0.1, 0.2, 0.35):
-        found[f"eta (G - Q), {part:g}, atoms by G"] = ByGain(metal, line, part, scale, by_gain=True, less=True)
+        yield "eta (G - Q), atoms by G", part, ByGain(metal, line, part, scale, by_gain=True, less=True)
     for energy in ENERGIES:
         spread = ae.TruncatedNormal(energy * scale, energy * scale)
-        found[f"{energy:g} eV"] = ae.RollUp(
-            spread, rule.probability, 1.0, 0.2, others=rule.others, others_height=rule.others_height
-        )
-    return found
+        yield "one energy [eV]", energy, replace(rule, energy=spread)
 
 
 def judged(metal, run, line):
@@ -111,7 +117,9 @@ def judged(metal, run, line):
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     found = poles(orientation.material, 10)
     normals = orientation.directions(found.normals)
-    for name, rule in rules(metal, line, scale).items():
+    series = {}
+    for kind, number, rule in rules(metal, line, scale):
+        name = f"{kind}, {number:g}"
         map = map_of(run, rule)
         if metal == "Mg":
             pole = np.array([0.0, 0.0, 1.0])
@@ -124,8 +132,25 @@ def judged(metal, run, line):
         target = measured_fold(metal)
         fold = folded(map, orientation, projection, METALS[metal])
         pairs = zip(rings(fold, METALS[metal]), rings(target, METALS[metal]), strict=True)
-        amplitudes = " ".join(f"{amplitude(a, b):5.2f}" for a, b in pairs)
-        print(f"{name:30} correlation {fold.correlation(target):.2f}, amplitudes {amplitudes}", flush=True)
+        values = [amplitude(a, b) for a, b in pairs]
+        text = " ".join(f"{value:5.2f}" for value in values)
+        print(f"{name:30} correlation {fold.correlation(target):.2f}, amplitudes {text}", flush=True)
+        series.setdefault(kind, []).append((number, values))
+    for radius, factors in {80: np.ones(3), **LARGER.get(metal, {})}.items():
+        for kind, rows in list(series.items())[1:]:
+            best(f"R = {radius} a, {kind}", [number for number, _ in rows], [values * factors for _, values in rows])
+
+
+def best(name, numbers, amplitudes):
+    """Print the number at which the mean logarithm of the amplitudes is 0, its range for 7 %, and the RMS there."""
+    logs = np.log(np.maximum(amplitudes, 1e-3))
+    means = logs.mean(axis=1)
+    if not means.min() < 0 < means.max():
+        print(f"{name}: mean logarithms of the amplitudes {means.round(2)}")
+        return
+    low, middle, high = np.exp(np.interp([-0.07, 0.0, 0.07], means, np.log(numbers)))
+    rest = np.sqrt(np.mean([np.interp(np.log(middle), np.log(numbers), column) ** 2 for column in logs.T]))
+    print(f"{name}: {middle:.3f} [{low:.3f}, {high:.3f}], RMS of the logarithms {rest:.2f}")
 
 
 def named(planes, indices):

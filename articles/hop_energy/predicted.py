@@ -1,8 +1,8 @@
 """Lines and poles of a run with wide responses, with the interval that 10 % of the field of evaporation allows.
 
-    python predicted.py RUNS/Ni-001_80_wide.h5
+    python predicted.py RUNS/Mg_80_wide.h5 --pole 0 0 0 1
 
-For each family of lines about the pole at the axis: the density on the line, and 1 to 2 degrees beside it, over that 3
+For each family of lines about a pole: the density on the line, and 1 to 2 degrees beside it, over that 3
 to 6 degrees beside it, as in `../three_metals/predictions.py`; and the density about the pole by degree. Columns: the
 rule of the metal for a field 10 % lower, as in the table, and 10 % higher; and for atoms that do not roll at all, as
 on a warm specimen if atoms leave at F(T).
@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[1] / "three_metals"))
+from fills import by_degree
 from judge import map_of, projection_of
 from predictions import across, lines_about
 
@@ -30,6 +31,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--temperature", type=float, default=60.0, help="[K]")
+    parser.add_argument("--pole", type=int, nargs="+", required=True, help="indices, such as 1 1 1")
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
     run = ae.load(options.run)
@@ -51,16 +53,17 @@ def main():
     found = poles(metal, 10)
     labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
     normals = orientation.directions(found.normals)
-    nearest = int(np.argmax(normals[:, 2]))
-    outer = min(run.settings["flights"]["field_of_view"] - 2 - np.degrees(np.arccos(min(normals[nearest, 2], 1.0))), 16)
-    print(f"about {labels[nearest]}, up to {outer:.0f} degrees")
+    nearest = orientation.nearest_pole(tuple(options.pole))
+    pole = np.asarray(nearest.direction)
+    outer = min(run.settings["flights"]["field_of_view"] - 2 - np.degrees(np.arccos(min(pole[2], 1.0))), 16)
+    print(f"about {options.pole}, up to {outer:.0f} degrees")
     for name, map in maps.items():
-        radial = ae.maps.pole_profile(map, projection, normals[nearest], np.arange(0, min(outer, 13), 1.0)).density
+        radial = by_degree(map, projection, nearest)
         print(f"  {name:12} by degree", " ".join(f"{each:.2f}" for each in radial))
-    for towards, directions in lines_about(normals[nearest], normals, labels):
+    for towards, directions in lines_about(pole, normals, labels) if outer > 8 else []:
         cells = []
         for map in maps.values():
-            (on, error), (beside, _) = across(map, projection, normals[nearest], directions, outer)
+            (on, error), (beside, _) = across(map, projection, pole, directions, outer)
             cells.append(f"{on:.2f} +- {error:.2f}, {beside:.2f}")
         print(f"  {towards:16} " + " | ".join(cells))
 

@@ -90,6 +90,20 @@ CHOICES = {
 }
 
 
+def form(metal, hops):
+    """Gain as alpha F^2 (phi^2 - 1)/2, with F at the site: alpha, its spread, phi over the charge ratio, self terms."""
+    gains, field = hops["above_energy"] - hops["site_energy"], hops["field"]
+    phi = hops["above_charge"] / hops["site_charge"]
+    unit = 1e-18 * ae.units.ELEMENTARY_CHARGE  # e nm^2/V to F m^2
+    alpha = 2.0 * gains / (field**2 * (phi**2 - 1.0)) * unit
+    slope, start = np.polyfit(hops["ratio"], phi, 1)
+    ratio = hops["above_energy"] / hops["above_charge"] ** 2 / (hops["site_energy"] / hops["site_charge"] ** 2)
+    cube = ae.material(metal).nearest_neighbour_distance ** 3 / ae.units.COULOMB  # F^2 d^3/k_e is an energy
+    return (f"alpha {np.median(alpha):.3g} F m^2 (spread {alpha.std() / alpha.mean():.3f}), over 4 pi epsilon_0 d^3 "
+            f"{np.median(alpha) / unit / cube:.4f}, phi {start:.2f} + {slope:.2f} x, self terms {np.median(ratio):.3f}, "
+            f"G over F^2 d^3/k_e {np.median(gains / field**2) / cube:.3f}")  # fmt: skip
+
+
 def row(name, cells):
     """Print a row."""
     print("| " + " | ".join([name, *cells]) + " |")
@@ -103,9 +117,7 @@ def main():
     paths = {m: {int(p.name.split("_")[1]): p for p in options.runs.glob(f"{m}_*_hops.npz")} for m in AXES}
     files = {m: {r: of_file(p) for r, p in sorted(of.items()) if r >= 20} for m, of in paths.items()}
     files = {m: of for m, of in files.items() if of}
-    print(
-        "numbers of hops, site over cap, bonds of the atom, gain over the place above (10, 50, 90 %, cap, F_evap) [eV]"
-    )
+    print("hops, site over cap, bonds of the atom, gain of the place above (10, 50, 90 %, cap, F_evap) [eV]")
     plain = CHOICES["above, cap, F_evap"]
     for metal, of in files.items():
         for radius, hops in of.items():
@@ -119,6 +131,7 @@ def main():
                   "hollow bonds", np.bincount(hops["hollow_bonds"]).tolist(),
                   "hollow gain", np.nanmedian(Choice("hollow", "half", "cap", False).gains(metal, hops)).round(2),
                   "half E_coh", ae.material(metal).cohesive_energy / 2)  # fmt: skip
+            print("   ", form(metal, hops))
     names = list(files)
     row("shares at 80 K", [f"{m} {'/'.join(str(r) for r in files[m])}" for m in names])
     for name, choice in CHOICES.items():
