@@ -7,6 +7,7 @@ from apt_evap.cli._options import (
     FILE_HELP,
     MAX_BINS,
     add_flight,
+    add_peaks,
     add_reading,
     add_real_units,
     add_speech,
@@ -84,6 +85,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
     group.add_argument("--scale", type=number_type("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
     add_flight(group)
+    add_peaks(group)
     add_real_units(parser)
     parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
     add_speech(parser)
