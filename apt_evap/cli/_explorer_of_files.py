@@ -1,16 +1,23 @@
 """Explorer of the files of `apt-evap explore`, by its options, and the same as text."""
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from apt_evap._common.codec import to_python
 from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration, with_masses
+from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
+from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
+from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
+from apt_evap.fit.start_settings import is_start
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
+from apt_evap.specimen.isotopes import ISOTOPES
 
 
 def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, ExplorerSettings | None]:
@@ -19,7 +26,8 @@ def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, 
     if _run_in(path) is not None:
         changes["run"] = path
     else:
-        changes |= dict.fromkeys((*_READING, *_SELECTION, *_OTHERS)) | {"file": path}
+        changes |= dict.fromkeys((*_READING, *_SELECTION, *_OTHERS))
+        changes |= {"file": path, "time_zero": 0.0, "all_ions": False}
     fresh = argparse.Namespace(**(vars(options) | changes))
     explorer_of_files = explorer_and_view(fresh)
     vars(options).update(vars(fresh))  # only if both files are good
@@ -60,7 +68,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     if run is not None:
         run.require_responses(repr(options.run))
         run = in_real_units(run, options)
-    measured, computed = (None, False) if options.file is None else _measured(options)
+    measured = None if options.file is None else _measured(options)
     registration = None
     if options.registration is not None:
         if measured is None or run is None:
@@ -76,20 +84,35 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         measured,
         registration,
         run_code="None" if run is None else _run_code(options),
-        measured_code="None" if options.file is None else _measured_code(options, computed),
+        measured_code="None" if options.file is None else _measured_code(options),
         run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
     start = explorer.start
     bins = options.bins or start.bins
     view = ExplorerSettings(
-        perturbation=perturbation or start.perturbation,
+        perturbation=perturbation or _recommended(options.run) or start.perturbation,
         bins=bins,
         smoothing=explorer.smoothing_for(bins) if options.smooth is None else options.smooth,
         flattening=options.flatten or 0.0,
         ions=_ions(options, explorer),
     )
     return explorer, view
+
+
+def _recommended(path):
+    """Emission of the settings of a run that were made from a measured map and lie beside it; None without them."""
+    settings = None if path is None else Path(path).with_suffix(".toml")
+    try:
+        if settings is None or not settings.is_file() or not is_start(settings):
+            return None
+        for panel in read_config(settings).maps.panels:
+            if not isinstance(panel.perturbation, Unperturbed):
+                values_of(panel.perturbation)
+                return panel.perturbation
+    except (ValueError, OSError):  # changed by hand: the run is shown without it
+        return None
+    return None
 
 
 def _ions(options, explorer):
@@ -105,14 +128,20 @@ def _ions(options, explorer):
 
 
 def _measured(options):
-    """Measured ions or the map, and whether masses of the ions are computed."""
+    """Measured ions with their selection, or the map."""
     content = read(options)
     if isinstance(content, Run):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
-        return content, False
-    hits = with_masses(content, options)
-    return ions_of_map(hits, options), hits is not content
+        return content
+    # the masses of species are those of the options; others follow the spectrum
+    hits = content if options.species is None else with_masses(content, options)
+    fresh = argparse.Namespace(**(vars(options) | {"mass": None, "ions": None}))
+    element = None if options.element is None else read_material(options.element, "--element").name
+    chosen = options.all_ions or options.mass is not None or options.species is not None
+    peaks_of = None if chosen or element not in ISOTOPES else element
+    selection = IonSelection(peaks_of, options.mass, options.ions)
+    return MeasuredIons(ions_of_map(hits, fresh), options.distance, options.time_zero, selection)
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
@@ -137,8 +166,8 @@ def _run_code(options):
 
 
 _READING = ("format", "byte_order", "voltage_unit", "arrays", "unit")
-_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort", "distance", "time_zero")
-_SELECTION = {"ions": "ion", "mass": "mass_to_charge", "voltage": "voltage"}
+_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort", "distance", "ions", "mass", "element")
+_SELECTION = {"voltage": "voltage"}  # besides what `MeasuredIons` selects
 
 
 def _measured_arguments(options):
@@ -152,10 +181,6 @@ def _measured_arguments(options):
     for name in _SELECTION:
         if (value := getattr(options, name)) is not None:
             arguments += [f"--{name}={','.join('' if bound is None else repr(bound) for bound in value)}"]
-    if options.distance is not None:
-        arguments += [f"--distance={options.distance!r}"]
-    if options.time_zero:
-        arguments += [f"--t0={options.time_zero!r}"]
     if options.circle is not None:
         radius, centre = options.circle
         arguments += [f"--circle={','.join(map(repr, (radius, *centre)))}"]
@@ -164,8 +189,8 @@ def _measured_arguments(options):
     return arguments
 
 
-def _measured_code(options, computed):
-    """Python expression that reads MEASURED; whether its masses are computed from times of flight."""
+def _measured_code(options):
+    """Python expression that reads MEASURED, without what `MeasuredIons` selects."""
     if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
         names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
         parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
@@ -174,7 +199,7 @@ def _measured_code(options, computed):
         name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
     } | ({"detector_unit": options.unit} if options.unit else {})
     code = f"ae.read({_call(options.file, parameters)})"
-    if computed:
+    if options.species is not None and options.distance is not None:
         code += f".with_masses({options.distance!r}, {options.time_zero!r})"
     for name, column in _SELECTION.items():
         if (bounds := getattr(options, name)) is not None:

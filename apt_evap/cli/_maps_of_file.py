@@ -7,7 +7,7 @@ from typing import Any
 
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
-from apt_evap.cli._files import in_real_units, ions_of_map, read, select, selects, with_masses
+from apt_evap.cli._files import in_real_units, ions_of_map, of_element, read, select, selects, with_masses
 from apt_evap.cli._output import say, tell
 from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
@@ -45,7 +45,9 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
         maps, titles = [content.smoothed(sigma)], [Path(options.file).name]
     else:
         selection = ions_of_map(with_masses(content, options), options)
-        part = f", {len(selection):,} of {len(content):,} ions" if selects(options) else ""
+        if options.element is not None:
+            selection = of_element(selection, options, content.mass_to_charge is None)
+        part = f", {len(selection):,} of {len(content):,} ions" if len(selection) < len(content) else ""
         maps = [binned(selection, options.bins, options.smooth)]
         titles = [f"{Path(options.file).name}{_species(options)}{part}"]
         content = selection

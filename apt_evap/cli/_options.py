@@ -70,6 +70,14 @@ def add_indexing(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_peaks(parser: Any) -> None:
+    """Add options of the ions in the peaks of an element."""
+    parser.add_argument(
+        "--element", metavar="NAME", help=f"use the ions in the peaks of a crystal, such as {MATERIAL_HELP}"
+    )
+    parser.add_argument("--all-ions", action="store_true", help="use all ions, also with --element")
+
+
 def add_flight(parser: Any) -> None:
     """Add options of the flight, from which masses follow."""
     parser.add_argument("--distance", type=number_type("mm"), metavar="MM", help="flight length of the instrument")

@@ -14,6 +14,7 @@ from html import escape
 from apt_evap.cli._options import (
     MAX_BINS,
     add_flight,
+    add_peaks,
     add_reading,
     add_real_units,
     bounds_type,
@@ -51,6 +52,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--flatten", type=number_type("mm"), metavar="MM", help="sigma for flattening; default: none")
     parser.add_argument("--simulated", type=bounds_type, metavar="FIRST,LAST", help="ions of the run; default: all")
     add_flight(parser)
+    add_peaks(parser)
     parser.add_argument("--port", type=integer_type(0, 65535), default=0, metavar="N", help="default: a free one")
     parser.add_argument("--no-browser", dest="browser", action="store_false", help="only print the address")
     parser.add_argument(

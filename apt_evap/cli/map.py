@@ -7,6 +7,7 @@ from apt_evap.cli._options import (
     FILE_HELP,
     MAX_BINS,
     add_flight,
+    add_peaks,
     add_reading,
     add_real_units,
     add_speech,
@@ -92,6 +93,7 @@ def _add_crystal(parser):
     group.add_argument("--rotation", type=float, metavar="DEGREES", help="of the crystal about its axis; no search")
     group.add_argument("--scale", type=number_type("mm/rad"), metavar="S", help="scale of the map [mm/rad]")
     add_flight(group)
+    add_peaks(group)
 
 
 def execute(options: argparse.Namespace) -> int:

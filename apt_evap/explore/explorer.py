@@ -22,6 +22,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
 from apt_evap.explore.marks import Overlay, overlay
+from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.placement import misplaced
 from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.fit_energies import BINS, measured_map
@@ -168,8 +169,8 @@ class Explorer:
     ----------
     run : Run, optional
         A run with responses, at the simulated voltage or in real units.
-    measured : Hits or DetectorMap, optional
-        Measured ions, or a map.
+    measured : Hits or MeasuredIons or DetectorMap, optional
+        Measured ions, with a selection of them, or a map.
     registration : Registration, optional
         Transform into the measured frame. By default only scaled to the same size, until `register` is called, which
         takes up to some minutes.
@@ -189,7 +190,7 @@ class Explorer:
     def __init__(
         self,
         run: Run | None = None,
-        measured: Hits | DetectorMap | None = None,
+        measured: Hits | MeasuredIons | DetectorMap | None = None,
         registration: Registration | None = None,
         *,
         preview: int = PREVIEW,
@@ -208,7 +209,9 @@ class Explorer:
                 raise ValueError("registration needs a run, and measured ions or a measured map, got only one of them")
         preview = check_count(preview, "preview", at_least=1)
         self.run: Any = run
-        self.measured = measured
+        self.ions_of_file = MeasuredIons(measured) if isinstance(measured, Hits) else measured
+        """All measured ions of the file and the selection of them, a map, or None."""
+        self.measured: Any = measured.hits if isinstance(measured, MeasuredIons) else measured
         self.run_code, self.measured_code = run_code, measured_code
         self._run_arguments = [] if run is None else list(run_arguments)
         self._measured_arguments = [] if measured is None else list(measured_arguments)
@@ -229,6 +232,12 @@ class Explorer:
     def is_comparison(self) -> bool:
         """Whether there are a run and a measurement."""
         return self.run is not None and self.measured is not None
+
+    def selection_changed(self) -> None:
+        """Take the ions that are now selected of the file."""
+        if isinstance(self.ions_of_file, MeasuredIons):
+            self.measured = self.ions_of_file.hits
+            self._kept_maps, self._kept_picture = {}, (None, None)
 
     @property
     def names(self) -> tuple[str, str]:
@@ -683,7 +692,7 @@ class Explorer:
         one = self.measured is None or self.run is None
         command = "map" if one and not settings.flattening else "explore"
         # options of the run follow both files
-        shell = ["apt-evap", command, *self._run_arguments[:1], *self._measured_arguments, *self._run_arguments[1:]]
+        shell = ["apt-evap", command, *self._run_arguments[:1], *self._measured_words, *self._run_arguments[1:]]
         shell += self._shell_options(settings, command)
         if settings.flattening:
             shell += ["--flatten", repr(settings.flattening)]
@@ -717,9 +726,19 @@ class Explorer:
         if self.measured is None:
             shell = shlex.join(["apt-evap", "map", *self._run_arguments, *self._shell_options(settings, "map"), box])
         elif isinstance(self.measured, Hits):
-            shell = shlex.join(["apt-evap", "map", *self._measured_arguments, box])
-            python.append(f"measured = {self.measured_code}{window}")
+            shell = shlex.join(["apt-evap", "map", *self._measured_words, box])
+            python.append(f"measured = {self._code_of_measured}{window}")
         return Commands(shell, "\n".join(python))
+
+    @property
+    def _measured_words(self):
+        ions = self.ions_of_file
+        return [*self._measured_arguments, *(ions.arguments if isinstance(ions, MeasuredIons) else [])]
+
+    @property
+    def _code_of_measured(self):
+        ions = self.ions_of_file
+        return ions.code(self.measured_code) if isinstance(ions, MeasuredIons) else self.measured_code
 
     def _shell_options(self, settings, command):
         options = [] if self.run is None else ["--perturbation", write_perturbation(settings.perturbation)]
@@ -747,7 +766,9 @@ class Explorer:
             names = ["simulated"]
         else:
             arguments = (
-                f"None, {self.measured_code}" if self.run is None else f"run, {self.measured_code}, registration"
+                f"None, {self._code_of_measured}"
+                if self.run is None
+                else f"run, {self._code_of_measured}, registration"
             )
             lines = [
                 "from apt_evap.explore.explorer import Explorer",

@@ -2,16 +2,15 @@
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from bokeh.models import AutocompleteInput
 
 from apt_evap.explore.search_process import start_thread
+from apt_evap.explore.start_page import files_to_open
 from apt_evap.explore.widgets import LEFT
 
 _MOST_FILES = 300  # that are proposed
-_SUFFIXES = (".h5", ".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
 
 
 class FilePanel:
@@ -40,7 +39,7 @@ class FilePanel:
         self._read, self._close, self._note, self._later = read, close, note, later
         self.field = AutocompleteInput(
             placeholder="open a file: a run or a measurement",
-            completions=[] if read is None else _files(),
+            completions=[] if read is None else files_to_open()[:_MOST_FILES],
             restrict=False,
             case_sensitive=False,
             search_strategy="includes",
@@ -70,9 +69,3 @@ class FilePanel:
     def _named(self):
         if self._read is not None and (path := self.field.value.strip()):
             self.open(path)
-
-
-def _files():
-    """Files of the current folder and the folders in it that can be opened."""
-    paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern))]
-    return [str(path) for path in paths if path.suffix.lower() in _SUFFIXES][:_MOST_FILES]

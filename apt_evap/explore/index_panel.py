@@ -74,6 +74,8 @@ class IndexPanel:
         As for `Page`.
     put_code : callable
         Shows Python lines.
+    kept : dict, optional
+        Crystal, marks and candidates; what an earlier page of this measurement left there is shown again.
     """
 
     def __init__(
@@ -83,13 +85,16 @@ class IndexPanel:
         material: str,
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
+        kept: dict[str, Any] | None = None,
     ) -> None:
+        self._kept: dict[str, Any] = {} if kept is None else kept
+        self._after_search: Callable[[], None] | None = None
         self._measured, self._later, self._put_code = measured, later, put_code
         self._tasks = NewestTaskRunner()
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._indexing: Indexing | None = None  # of the search that gave the candidates
         self._awaited: Any = None  # the fit or search whose candidates will be shown, unless others come first
-        self._make_widgets(material)
+        self._make_widgets(self._kept.get("material") or material)
         self._make_drawings(figures[-1])
         number = len(figures) - 1
         drags = [None] * number + [self.tool]
@@ -97,7 +102,12 @@ class IndexPanel:
             name: MouseTool(drags, partial(self._clicked, number, name == "zone line"))
             for name in ("pole", "zone line")
         }
+        marks, candidates = self._kept.get("marks"), self._kept.get("candidates")
         self._material_changed()
+        if marks is not None:
+            self.marks.data = marks
+        if candidates:
+            self._put(*candidates)
 
     def close(self) -> None:
         """End the fits."""
@@ -105,7 +115,8 @@ class IndexPanel:
 
     def _make_widgets(self, material):
         half = (LEFT - 20) // 2
-        self.material = Select(title="crystal", options=list(MATERIALS), value=material, width=half)
+        options = [("", "choose it"), *((name, name) for name in dict.fromkeys([*MATERIALS, material]) if name)]
+        self.material = Select(title="crystal", options=options, value=material, width=half)
         self.family = Select(title="family of the pole", width=half, options=[])
         self.scale = NumericInput(title="scale [mm/rad]", placeholder="fitted", mode="float", low=1e-3, width=half)
         self.centre = [
@@ -182,6 +193,11 @@ class IndexPanel:
         new = {"x": x, "y": y, "family": self.family.value, "line": self._line if of_line else 0}
         self.marks.data = {name: [*values, new[name]] for name, values in self.marks.data.items()}
 
+    def propose(self, name: str) -> None:
+        """Choose the crystal, if none is chosen."""
+        if not self.material.value and name in MATERIALS:
+            self.material.value = name
+
     def _clicked(self, number, of_line, figure, x, y):
         if figure == number:
             self.add(x, y, of_line)
@@ -197,12 +213,25 @@ class IndexPanel:
         self._line = max([0, *self.marks.data["line"]]) + 1
 
     def _material_changed(self):
+        self._kept["material"] = self.material.value
+        if not self.material.value:
+            self.family.update(options=[], value="")
+            self._clear()
+            return
         families = list(Marks(self.material.value).families)
         self.family.update(options=families, value=families[0])
         self._clear()
 
     def read(self) -> Marks:
-        """The marks on the map."""
+        """The marks on the map.
+
+        Raises
+        ------
+        ValueError
+            If no crystal is chosen.
+        """
+        if not self.material.value:
+            raise ValueError("choose the crystal first")
         marks = Marks(self.material.value)
         lines: dict[int, tuple[int, list[tuple[float, float]]]] = {}
         for x, y, family, line in zip(*(self.marks.data[name] for name in ("x", "y", "family", "line")), strict=True):
@@ -218,6 +247,10 @@ class IndexPanel:
 
     def fit(self) -> None:
         """Fit the marks; the candidates come later."""
+        self._kept["marks"] = {name: list(values) for name, values in self.marks.data.items()}
+        if not self.material.value:
+            self._put([], "choose the crystal first")
+            return
         marks = self.read()
         if len(marks.poles) < 2 and not (marks.poles and marks.lines and self.scale.value):
             self._put([], self._missing(marks))
@@ -232,6 +265,9 @@ class IndexPanel:
 
     def _search(self, button, start=None):
         """Search over all orientations by `index`, or refine one, in another process; marks narrow it."""
+        if not self.material.value:
+            self._put([], "choose the crystal first")
+            return
         marks = self.read()
         options: dict[str, Any] = {
             "poles": [(*place, marks.planes[number]) for number, place in marks.poles],
@@ -255,6 +291,9 @@ class IndexPanel:
             button.label = label
             if self._awaited is inputs:  # no mark, fit or handle has changed
                 self._put_searched(indexing, text)
+            after, self._after_search = self._after_search, None
+            if after is not None:
+                after()
 
         def work():
             with SearchProcess() as process:
@@ -270,9 +309,23 @@ class IndexPanel:
         ]  # fmt: skip
         self._put(rows, text, indexing)
 
+    def search_before(self, then: Callable[[], None]) -> None:
+        """Call a function with candidates: at once if there are some, or else after a search."""
+        if self.candidates:
+            then()
+            return
+        self._after_search = then
+        if self.material.value:
+            self._search(self.search)
+        else:
+            self._after_search = None
+            then()
+
     def settings(self, minutes: float, threads: int) -> StartSettings:
         """Settings of a simulation of the chosen candidate, as ``apt-evap start`` makes them; in any thread."""
         if not self.candidates:
+            if not self.material.value:
+                raise ValueError("choose the crystal first")
             raise ValueError("index the map first: click poles, or search")
         number, measured = int(self.choice.value or 0), self._measured()
         indexing = self._indexing
@@ -308,7 +361,7 @@ class IndexPanel:
 
     def _put(self, candidates, text, indexing=None):
         self.candidates, self._indexing, self._awaited = candidates, indexing, None
-        self._hint = text
+        self._hint, self._kept["candidates"] = text, (candidates, text, indexing)
         options = []
         for number, (orientation, projection, quality) in enumerate(candidates):
             axis = " ".join(f"{component:.2f}" for component in orientation.axis)

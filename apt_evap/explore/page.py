@@ -18,6 +18,7 @@ from apt_evap.explore.file_panel import FilePanel
 from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.ion_panel import IonPanel
 from apt_evap.explore.map_views import MapFigures
+from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.mouse_tools import MouseTools
 from apt_evap.explore.newest_task import NewestTaskRunner
 from apt_evap.explore.pole_panel import PolePanel
@@ -27,6 +28,8 @@ from apt_evap.explore.rings_panel import RingsPanel
 from apt_evap.explore.run_panel import RunPanel, ServerState
 from apt_evap.explore.search_process import guarded
 from apt_evap.explore.specimen_panel import SpecimenPanel
+from apt_evap.explore.spectrum_panel import SpectrumPanel
+from apt_evap.explore.start_page import StartPage
 from apt_evap.explore.style import STYLES, WIDGETS, page_styles, theme
 from apt_evap.explore.summary_panel import SummaryPanel
 from apt_evap.explore.widgets import LEFT, Tabs, group, maps_and_tabs, save_button
@@ -90,7 +93,8 @@ class Page:
         self.simulation: RunPanel | None = None
         self.index: IndexPanel | None = None
         if explorer is None:
-            body = []
+            self.start = StartPage(self.files.open) if opened is not None else None
+            body = [] if self.start is None else [self.start.column]
         else:
             self.maps = explorer.show(explorer.start if settings is None else settings)
             self._make_panels(registration_of, ServerState() if state is None else state, read is not None)
@@ -134,15 +138,21 @@ class Page:
             self.poles = PolePanel(explorer, maps, figures)
             tools = {"atoms": self.specimen.tool} | tools
             self._panels += [self.specimen, self.rings, self.poles]
+        self.spectrum: SpectrumPanel | None = None
         if explorer.measured is not None:
             self.index = IndexPanel(
-                figures, lambda: explorer.measured, self._material(), self._later, self.code.put_python
-            )
+                figures, lambda: explorer.measured, self._material(), self._later, self.code.put_python,
+                state.indexed.setdefault(explorer.names[1], {}),
+            )  # fmt: skip
             self.simulation = RunPanel(
                 self.index.settings, f"{Path(explorer.names[1]).stem}.toml", state, self._later,
-                self.code.put_python, self.files.open if is_opening else None,
+                self.code.put_python, self.files.open if is_opening else None, self.index.search_before,
             )  # fmt: skip
             tools |= self.index.tools
+            if isinstance(explorer.ions_of_file, MeasuredIons):
+                self.spectrum = SpectrumPanel(
+                    explorer.ions_of_file, explorer.names[1], self._ions_selected, self.index.propose, self._later
+                )
         if explorer.is_comparison:
             emission = self.emission
             self.registration = RegistrationPanel(
@@ -153,6 +163,12 @@ class Page:
         if explorer.is_comparison:
             self.tools.choice.on_change("active", lambda attr, old, new: self._show_candidate())
             self._show_candidate()
+
+    def _ions_selected(self):
+        """Show other measured ions; they lie where those before lay."""
+        self.explorer.selection_changed()
+        self.summary.put_facts()
+        self.request(False)
 
     def _show_candidate(self):
         """Poles of the candidate while the map is indexed, else those of the run."""
@@ -166,7 +182,7 @@ class Page:
             material = self.explorer.run.settings["tip"].get("material", {})
             if material.get("name") in MATERIALS:
                 return material["name"]
-        return "W"
+        return ""
 
     # ---- layout ----------------------------------------------------------------------------------------------------
 
@@ -184,6 +200,8 @@ class Page:
         groups = []
         if self.emission is not None:
             groups.append(group("emission", self.emission.widgets, self.emission.reset))
+        if self.spectrum is not None:
+            groups.append(group("measured ions", self.spectrum.controls, active=not has_run))
         if self.index is not None and self.simulation is not None:
             groups.append(group("crystal", [self.index.column], active=not has_run))
             groups.append(group("simulate", [self.simulation.column], active=not has_run))
@@ -198,6 +216,8 @@ class Page:
 
     def _right(self):
         contents: dict[str, Any] = {} if self.specimen is None else {"specimen": self.specimen.widgets}
+        if self.spectrum is not None:
+            contents["spectrum"] = self.spectrum.widgets
         contents |= {"profile": self.profile.widgets, "code": self.code.widgets}
         tools = [self.tools.row] if self.poles is None else [self.tools.row, self.poles.button]
         self.tabs = Tabs(contents)
@@ -221,6 +241,8 @@ class Page:
         self.root.stylesheets = [GlobalInlineStyleSheet(css="body { margin: 0; }")]
         if self.registration is not None:
             self.document.js_on_event(DocumentReady, CustomJS(args={"mode": self.figures.mode}, code=_KEY_B))
+        if self.explorer is None and self.start is not None:
+            self.document.js_on_event(DocumentReady, self.start.drop)
         self.document.add_root(self.root)
 
     def _next_style(self):

@@ -1,5 +1,6 @@
 """Group of the page that writes the settings of a simulation of the measured specimen, and runs it."""
 
+import itertools
 import os
 from collections.abc import Callable
 from functools import partial
@@ -15,9 +16,10 @@ from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import short_text
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.explore.search_process import guarded, start_thread
-from apt_evap.explore.widgets import LEFT
+from apt_evap.explore.widgets import LEFT, group
 from apt_evap.fit.start_settings import StartSettings
 
+_SIMULATE = "simulate this specimen"
 INTERVAL = 500
 """Time between two updates of the state of the run [ms]."""
 
@@ -30,6 +32,8 @@ class ServerState:
         """The run in the background."""
         self.registration_options: dict[str, dict[str, Any]] = {}
         """Options of `register` for the files of runs."""
+        self.indexed: dict[str, dict[str, Any]] = {}
+        """What `IndexPanel` keeps, for the files of measurements."""
 
 
 class RunPanel:
@@ -49,6 +53,8 @@ class RunPanel:
         Shows the text of the settings file.
     open_run : callable, optional
         Opens a file on the page.
+    search_before : callable, optional
+        Calls a function after a search for candidates, if there are none.
     """
 
     def __init__(
@@ -59,20 +65,25 @@ class RunPanel:
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
         open_run: Callable[[str], None] | None = None,
+        search_before: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
         self._settings, self._state, self._later = settings, state, later
         self._put_code, self._open_run = put_code, open_run
+        self._search_before = search_before or (lambda then: then())
         self._confirmed = ""  # the file whose replacement was asked for
         half = (LEFT - 20) // 2
         self.file = TextInput(title="settings file", value=name, width=half)
         self.minutes = NumericInput(title="minutes of the run", value=10.0, mode="float", low=0.1, width=half)
         self.write = Button(label="write settings", width=half)
         self.start = Button(label="start the run", width=half)
-        self.text = Div(width=LEFT - 10, text="from the chosen candidate; index the map first")
+        self.simulate = Button(label=_SIMULATE, button_type="primary", width=LEFT - 10)
+        self.simulate.on_click(self._simulate_or_stop)
+        self.text = Div(width=LEFT - 10, text="as the chosen candidate says; without one, it is searched first")
         self.file.on_change("value", lambda attr, old, new: self._forget_confirmation())
         self.write.on_click(self._write)
         self.start.on_click(self._start_or_stop)
-        self.column = column(row(self.file, self.minutes), row(self.write, self.start), self.text)
+        further = group("more", [row(self.file, self.minutes), row(self.write, self.start)], active=False)
+        self.column = column(self.simulate, self.text, further)
         self._closed = False
         if state.run is not None:
             self._update()
@@ -130,6 +141,42 @@ class RunPanel:
             self._state.registration_options[str(path.with_suffix(".h5"))] = made.registration
             self._put_code(made.text)
 
+    def _simulate_or_stop(self):
+        guarded(self._simulate_specimen, self._show)()
+
+    def _simulate_specimen(self):
+        """Write settings to a new file and start their run, or stop the run."""
+        run = self._state.run
+        if run is not None and run.active:
+            run.stop()
+            return
+        path = self.path.with_suffix(".toml")
+        self.simulate.disabled = True
+        self._show("searching for the orientation")
+        self._search_before(partial(self._make_and_start, path))
+
+    def _make_and_start(self, path):
+        self._show("making the settings")
+        minutes = self.minutes.value or 10.0
+
+        def work():
+            made = self._settings(minutes, thread_count())
+            free = _free_path(path, made.text)
+            made.save(free)
+            self._later(partial(self._made, made, free), 0)
+
+        start_thread(work, lambda sentence: self._later(partial(self._not_made, sentence), 0))
+
+    def _not_made(self, sentence):
+        self.simulate.disabled = False
+        self._show(sentence)
+
+    def _made(self, made, path):
+        self.simulate.disabled = False
+        self.file.value = str(path)
+        self._written(f"wrote {path}: {made.cost}", made, path)
+        self._start_or_stop()
+
     def _start_or_stop(self):
         guarded(self._start_or_stop_run, self._show)()
 
@@ -152,6 +199,7 @@ class RunPanel:
             return
         active = run.active  # set by another thread
         self.start.label = "stop the run" if active else "start the run"
+        self.simulate.label = "stop the run" if active else _SIMULATE
         if active:
             left = "" if run.seconds_left is None else f", {_duration(run.seconds_left)} left"
             state = run.message or f"{run.ions:,} of {run.n_ions:,} ions{left}"
@@ -167,6 +215,17 @@ class RunPanel:
             self._show(f"{run.output} has all ions: apt-evap explore {run.output}")
             if self._open_run is not None:
                 self._open_run(str(run.output))
+
+
+def _free_path(path: Path, text: str) -> Path:
+    """The path, with a number if it, or its run, exists and is not of these settings."""
+    for number in itertools.count(2):
+        if path.is_file() and path.read_bytes() == text.encode():
+            return path
+        if not any(path.with_suffix(suffix).exists() for suffix in (".toml", ".h5", ".h5.unfinished")):
+            return path
+        path = path.with_stem(f"{path.stem.removesuffix(f'_{number - 1}')}_{number}")
+    raise AssertionError("unreachable")
 
 
 def _duration(seconds):

@@ -13,7 +13,10 @@ from bokeh.util.token import generate_session_id
 
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.page import Page
+from apt_evap.explore.recent_files import remember_file
 from apt_evap.explore.run_panel import ServerState
+from apt_evap.explore.start_page import EXAMPLE, write_example
+from apt_evap.explore.upload import UploadHandler
 from apt_evap.maps.registration.register import Registration
 
 _ADDRESS = "127.0.0.1"
@@ -99,7 +102,10 @@ def serve(
         """Read a file, in any thread; the function that is returned makes the page again, in that of the document."""
         nonlocal shown
         assert with_file is not None
+        if path == EXAMPLE:
+            write_example()
         shown = with_file(path)
+        remember_file(path)
         if shown[0] is not None:
             shown[0].registration_options = state.registration_options.get(path, {})
 
@@ -117,6 +123,7 @@ def serve(
         port=port,
         address=_ADDRESS,
         secret_key=key,
+        extra_patterns=[("/upload", UploadHandler, {"key": key})],
         sign_sessions=True,
         generate_session_ids=False,
         allow_websocket_origin=[f"{_ADDRESS}:{port}", f"localhost:{port}", *origins],

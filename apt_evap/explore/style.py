@@ -18,6 +18,7 @@ WIDGETS = """
 .bk-input::placeholder { color: var(--faint); }
 .bk-btn-default:hover, .bk-btn-default:disabled { background-color: var(--edge); color: var(--ink); }
 .bk-btn-default.bk-active, .bk-btn.bk-active { background-color: #2f6fb3; color: #ffffff; }
+.bk-btn-primary, .bk-btn-primary:hover { background-color: #2f6fb3; color: #ffffff; font-weight: 600; }
 .bk-btn { padding: 4px 8px; }
 small { font-size: 12px; color: var(--faint); }
 .noUi-target { background-color: var(--edge); }

@@ -35,10 +35,15 @@ class SummaryPanel:
         self._explorer = explorer
         self._judged: tuple[Any, Any] = (None, None)  # registration and verdict of the last maps that were judged
         self._readout_waits = False
-        facts = ["<b>apt-evap explore</b>"] if explorer is None else _facts(explorer)
-        self.facts = Div(text=" &nbsp; ".join(facts), sizing_mode="stretch_width")
+        self.facts = Div(sizing_mode="stretch_width")
+        self.put_facts()
         self.readout = Div(sizing_mode="stretch_width")
         self.notes = Div(sizing_mode="stretch_width", styles={"color": "#d9822b"}, visible=False)
+
+    def put_facts(self) -> None:
+        """Say what the files contain."""
+        facts = ["<b>apt-evap explore</b>"] if self._explorer is None else _facts(self._explorer)
+        self.facts.text = " &nbsp; ".join(facts)
 
     def put(self, maps: ExplorerMaps) -> None:
         """Show the numbers and the notes of maps, those of a preview a little later."""

@@ -24,7 +24,9 @@ from bokeh.util.token import generate_jwt_token, generate_session_id
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
+from apt_evap.cli._explorer_of_files import explorer_and_view
 from apt_evap.cli._files import read_registration
+from apt_evap.cli.parser import make_parser
 from apt_evap.explore.map_views import MODES
 from apt_evap.explore.page import Page
 from apt_evap.explore.run_panel import ServerState
@@ -555,12 +557,12 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     asked = []
     opened = Opened(Explorer(None, measured), opened=lambda path, document: lambda: asked.append(path))
     page, index, panel = opened.page, opened.page.index, opened.page.simulation
+    index.material.value = "Ni"
     panel._write()
     opened.settle(lambda: not panel.write.disabled)
     assert "index the map first" in panel.text.text and not list(tmp_path.iterdir())
     panel._start_or_stop()
     assert "write the settings first" in panel.text.text
-    index.material.value = "Ni"
     orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
     for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200")):
         index.family.value = family
@@ -589,6 +591,83 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
         == index.settings(1.0, 1).registration["start"].shift
     )
     assert panel.start.label == "start the run"
+
+
+def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
+    """From marks to a run that opens with the emission that its settings recommend; marks outlive the page."""
+    monkeypatch.chdir(tmp_path)
+    np.savez("specimen.npz", counts=measured.values, x_edges_mm=measured.x_edges, y_edges_mm=measured.y_edges)
+    asked, state = [], ServerState()
+    explorer = Explorer(None, measured, measured_arguments=["specimen.npz"])
+    opened = Opened(explorer, opened=lambda path, document: lambda: asked.append(path), state=state)
+    index, panel = opened.page.index, opened.page.simulation
+    panel._simulate_or_stop()
+    opened.settle(lambda: not panel.simulate.disabled)
+    assert "choose the crystal" in panel.text.text and not list(tmp_path.glob("*.toml"))
+    index.material.value = "Ni"
+    orientation, projection = ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0)
+    for plane, family in (((1, 1, 1), "111"), ((0, 0, 2), "200"), ((0, 2, 0), "200")):
+        index.family.value = family
+        ((x, y),) = projection.places(orientation.directions([np.array(plane) / np.linalg.norm(plane)]))
+        index.add(float(x), float(y), of_line=False)
+    opened.settle(lambda: index.candidates and "scale 60.0" in index.text.text)
+    (tmp_path / "specimen.toml").write_text("mine")
+
+    def fewer(minutes, threads):
+        made = index.settings(1.0, threads)
+        return replace(made, text=re.sub(r"ions = [\d_]+", "ions = 200", made.text))
+
+    monkeypatch.setattr(panel, "_settings", fewer)
+    panel._simulate_or_stop()
+    opened.settle(lambda: asked)
+    run = tmp_path / "specimen_2.h5"  # nothing is replaced
+    assert asked == [str(run)] and len(ae.load(run)) == 200 and (tmp_path / "specimen.toml").read_text() == "mine"
+    assert panel.simulate.label == "simulate this specimen"
+    _, view = explorer_and_view(make_parser().parse_args(["explore", str(run), "specimen.npz"]))
+    panels = read_config(run.with_suffix(".toml")).maps.panels
+    assert view.perturbation == panels[1].perturbation and view.perturbation.energy == 0.35
+    again = Opened(Explorer(None, measured, measured_arguments=["specimen.npz"]), state=state).page
+    assert again.index.material.value == "Ni" and len(again.index.read().poles) == 3
+    assert np.array_equal(again.index.candidates[0][0].matrix, index.candidates[0][0].matrix)
+    assert len(again.index.lines.data["x"]) > 10
+    again.close()
+    opened.page.close()
+
+
+def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
+    """The crystal and its ions are those of the peaks; a range that is dragged, and ranges that are saved."""
+    monkeypatch.chdir(tmp_path)
+    rng, n = np.random.default_rng(4), 20_000
+    mass = rng.choice([62.93, 64.93, 13.988], n, p=[0.5, 0.22, 0.28]) * rng.normal(1.0, 3e-4, n)
+    x, y = rng.normal(size=(2, n)) * 8.0
+    hits = ae.Hits(x=x, y=y, mass_to_charge=mass, pulse_id=np.arange(n))
+    opened = Opened(Explorer(None, hits, measured_arguments=["ions.epos"]))
+    page, panel = opened.page, opened.page.spectrum
+    opened.settle(lambda: panel.named is not None)
+    opened.settle(lambda: page.explorer.ions_of_file.selection.element == "Cu" and "Da" in panel.told.text)
+    assert page.index.material.value == "Cu" and "--element=Cu" in page.explorer.commands(page.settings()).shell
+    copper = (mass > 60).sum()
+    opened.settle(lambda: page.maps.measured.ions is not None and page.maps.measured.ions <= copper)
+    assert f"{len(page.explorer.measured):,} of 20,000 ions" in panel.told.text
+    assert len(panel.ranges.data["left"]) >= 2 and "Cu+" in panel.labels.data["label"] and panel.figure.visible
+    box = {"type": "rect", "x0": 13.0, "x1": 15.0, "y0": 1.0, "y1": 9.0}
+    panel._dragged(SimpleNamespace(geometry=box, final=True))
+    opened.settle(lambda: len(page.explorer.measured) == (mass < 15).sum() and "13 to 15 Da" in panel.told.text)
+    assert panel.choice.value == "ions of a range"
+    throttled(panel.slider, (0, 1000))
+    opened.settle(lambda: len(page.explorer.measured) == (mass[:1000] < 15).sum())
+    panel.choice.value = "all ions"
+    opened.settle(lambda: len(page.explorer.measured) == 1000)
+    panel._save()
+    saved = ae.io.read_ranges("ions.rrng")
+    assert "Cu" in saved.species_names and len(saved) == len(panel.named.ranges)
+    (tmp_path / "ions.rrng").write_text("mine")
+    panel._save()
+    assert (tmp_path / "ions.rrng").read_text() == "mine" and panel.save.label == "replace ions.rrng"
+    panel._save()
+    assert len(ae.io.read_ranges("ions.rrng")) == len(saved)
+    page.document.validate()
+    page.close()
 
 
 def test_a_page_made_again_shows_the_run(measured, tmp_path):

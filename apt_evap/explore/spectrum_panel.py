@@ -1,0 +1,260 @@
+"""Panel of the measured ions: their mass spectrum, and the masses and the part of the sequence that the maps show."""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bokeh.events import SelectionGeometry
+from bokeh.layouts import row
+from bokeh.models import (
+    BoxSelectTool,
+    Button,
+    ColumnDataSource,
+    Div,
+    LabelSet,
+    NumericInput,
+    RangeSlider,
+    Select,
+    TextInput,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+
+from apt_evap.detection.mass_spectrum import Spectrum
+from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
+from apt_evap.explore.search_process import start_thread
+from apt_evap.explore.widgets import LEFT
+from apt_evap.io.rrng import write_rrng
+
+_BINS = 2000
+_COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
+_ALL = "all ions"
+_OF_MASS = "ions of a range"
+
+
+class SpectrumPanel:
+    """Spectrum, and the widgets that select ions.
+
+    Parameters
+    ----------
+    ions : MeasuredIons
+        The measured ions.
+    name : str
+        File of the measurement.
+    selected : callable
+        Called after the selection has changed.
+    crystal : callable
+        Receives the element of most ions.
+    later : callable
+        As for `Page`.
+    """
+
+    def __init__(
+        self,
+        ions: MeasuredIons,
+        name: str,
+        selected: Callable[[], None],
+        crystal: Callable[[str], None],
+        later: Callable[[Callable[[], None], int], Any],
+    ) -> None:
+        self._ions, self._selected, self._crystal, self._later = ions, selected, crystal, later
+        self._path = Path(f"{Path(name).stem or 'ions'}.rrng")
+        self._confirmed = False
+        self.named: Spectrum | None = None
+        """The spectrum that is shown."""
+        number = len(ions.all)
+        window = tuple(
+            end if bound is None else int(bound)
+            for bound, end in zip(ions.selection.ions or (None, None), (0, number), strict=True)
+        )
+        self.slider = RangeSlider(
+            title="ions from - to", start=0, end=number, step=max(1, number // 200), value=window, format="0,0",
+            width=LEFT - 20,
+        )  # fmt: skip
+        self.slider.on_change("value_throttled", lambda attr, old, new: self._select())
+        self.choice = Select(title="masses", options=[_ALL], value=_ALL, width=LEFT - 10)
+        self.choice.on_change("value", lambda attr, old, new: self._select())
+        self.told = Div(width=LEFT - 10)
+        self.controls: list[Any] = [self.choice, self.slider, self.told]
+        self._make_spectrum()
+        self._tell()
+        if ions.has_masses:
+            self._name_peaks()
+
+    def _make_spectrum(self):
+        wheel, drag = WheelZoomTool(dimensions="width"), BoxSelectTool(dimensions="width")
+        self.figure: Any = figure(
+            sizing_mode="stretch_width", height=300, y_axis_type="log", tools=[wheel, drag], toolbar_location=None,
+            x_axis_label="m/n [Da]", y_axis_label="ions", active_scroll=wheel, active_drag=drag, visible=False,
+        )  # fmt: skip
+        self.ranges = ColumnDataSource({name: [] for name in ("left", "right", "top", "bottom", "color")})
+        self.counts = ColumnDataSource({"x": [], "y": []})
+        self.background = ColumnDataSource({"x": [], "y": []})
+        self.labels = ColumnDataSource({"x": [], "y": [], "label": [], "color": []})
+        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.35,
+                         line_color="color")  # fmt: skip
+        self.figure.step("x", "y", source=self.counts, mode="after", line_color="#e3e6ea")
+        self.figure.line("x", "y", source=self.background, line_color="#98a2ad", line_dash="dashed")
+        self.figure.add_layout(
+            LabelSet(x="x", y="y", text="label", text_color="color", source=self.labels, text_font_size="13px",
+                     y_offset=2, text_align="center")
+        )  # fmt: skip
+        self.figure.on_event(SelectionGeometry, self._dragged)
+        self.elements = TextInput(title="ions to name", placeholder="such as W, CrO", width=145)
+        self.elements.on_change("value", lambda attr, old, new: self._name_peaks())
+        self.distance = NumericInput(
+            title="flight length [mm]", value=self._ions.distance, mode="float", low=1.0, width=105,
+            visible=self._ions.all.mass_to_charge is None and not self._ions.lacks_times,
+        )  # fmt: skip
+        self.distance.on_change("value", lambda attr, old, new: self._distance_changed())
+        self.save = Button(label="save ranges", width=100, margin=(23, 5, 5, 5), disabled=True)
+        self.save.on_click(self._save)
+        why = "reading the masses" if self._ions.has_masses else "no masses: the file has no m/n"
+        if self._ions.lacks_distance:
+            why = "Masses follow from the times of flight: type the flight length of the instrument."
+        self.text = Div(text=why, sizing_mode="stretch_width")
+        self.widgets: list[Any] = [
+            row(self.elements, self.distance, self.save, styles={"flex-wrap": "wrap"}), self.figure, self.text,
+        ]  # fmt: skip
+
+    # ---- the spectrum ----------------------------------------------------------------------------------------------
+
+    def _distance_changed(self):
+        if self.distance.value:
+            self._ions.distance = self.distance.value
+            self._name_peaks()
+
+    def _name_peaks(self):
+        """Compute the spectrum in a thread."""
+        elements = [name for name in re.split(r"[,\s]+", self.elements.value) if name] or None
+        self.text.text = "naming the peaks"
+
+        def work():
+            named = self._ions.spectrum(elements)
+            self._later(partial(self._put, named, elements is None), 0)
+
+        start_thread(work, lambda sentence: self._later(partial(setattr, self.text, "text", escape(sentence)), 0))
+
+    def _put(self, named, by_itself):
+        self.named = named
+        if named.flight is not None and named.flight.peaks:  # its masses are those of the figure
+            self._ions.distance, self._ions.time_zero = (
+                round(named.flight.distance, 2),
+                round(named.flight.time_zero, 2),
+            )
+        self._draw()
+        parts = [escape(line) for line in str(named).splitlines()]
+        self.text.text = "Drag over peaks to see the map of their ions.<br>" + "<br>".join(parts)
+        formulas = list(dict.fromkeys(peak.formula for peak in named.peaks))
+        main = main_element(named)
+        chosen = self._ions.selection
+        options = [_ALL, *(f"ions of {formula}" for formula in formulas)]
+        if chosen.element is not None and f"ions of {chosen.element}" not in options:
+            options.append(f"ions of {chosen.element}")
+        if chosen.mass is not None:
+            options.append(_OF_MASS)
+        self.choice.options = options
+        self.save.disabled = not formulas
+        if chosen.element is not None or chosen.mass is not None:
+            self.choice.value = _OF_MASS if chosen.mass is not None else f"ions of {chosen.element}"
+        if main is not None and by_itself:
+            self._crystal(main)
+            if chosen.element is None and chosen.mass is None:
+                self.choice.value = f"ions of {main}"  # the default masses
+
+    def _draw(self):
+        mass = self.named.hits.mass_to_charge
+        mass = mass[np.isfinite(mass) & (mass > 0)]
+        intervals = [interval for peak in self.named.peaks for interval in peak.intervals]
+        last = max([1.5 * high for _, high in intervals], default=float(np.percentile(mass, 99)))
+        count, edges = np.histogram(mass, np.linspace(0.0, last, _BINS + 1))
+        least = 0.5
+        self.counts.data = {"x": edges[:-1], "y": np.maximum(count, least)}
+        coarse = edges[::20]
+        below = np.maximum(self.named.background(coarse) / 20, least)
+        self.background.data = {"x": (coarse[1:] + coarse[:-1]) / 2, "y": below}
+        top = float(max(count.max(), 10))
+        self.figure.y_range.update(start=least, end=6 * top)
+        self.figure.x_range.update(start=0.0, end=last)
+        formulas = list(dict.fromkeys(peak.formula for peak in self.named.peaks))
+        drawn: dict[str, list[Any]] = {name: [] for name in self.ranges.data}
+        labels: dict[str, list[Any]] = {name: [] for name in self.labels.data}
+        for peak in self.named.peaks:
+            color = _COLORS[formulas.index(peak.formula) % len(_COLORS)]
+            for low, high in peak.intervals:
+                new = {"left": low, "right": high, "top": 6 * top, "bottom": least, "color": color}
+                drawn = {name: [*values, new[name]] for name, values in drawn.items()}
+            low, high = peak.intervals[0][0], peak.intervals[-1][1]
+            inside = count[(edges[1:] > low) & (edges[:-1] < high)]
+            middle = (low + high) / 2
+            if all(abs(middle - place) > 0.03 * last for place in labels["x"]):
+                new = {"x": middle, "y": float(inside.max(initial=1)), "label": peak.name, "color": color}
+                labels = {name: [*values, new[name]] for name, values in labels.items()}
+        self.ranges.data, self.labels.data = drawn, labels
+        self.figure.visible = True
+
+    # ---- the selection ---------------------------------------------------------------------------------------------
+
+    def _dragged(self, event):
+        box = event.geometry
+        if event.final and box.get("type") == "rect":
+            mass = float(f"{max(box['x0'], 0.0):.5g}"), float(f"{box['x1']:.5g}")
+            self._select(mass)
+
+    def _select(self, mass=None):
+        """Select ions by the widgets, in a thread."""
+        element = None
+        if mass is not None:
+            if _OF_MASS not in self.choice.options:
+                self.choice.options = [*self.choice.options, _OF_MASS]
+        elif self.choice.value == _OF_MASS:
+            mass = self._ions.selection.mass
+        elif self.choice.value != _ALL:
+            element = self.choice.value.removeprefix("ions of ")
+        first, last = (int(end) for end in self.slider.value)
+        ions = None if (first, last) == (0, len(self._ions.all)) else (first, max(last, first + 1))
+        selection = IonSelection(element, mass, ions)
+        if selection == self._ions.selection:
+            return
+        self.told.text = "selecting ions"
+
+        def work():
+            self._ions.select(selection)
+            self._later(self._put_selection, 0)
+
+        start_thread(work, lambda sentence: self._later(partial(setattr, self.told, "text", escape(sentence)), 0))
+
+    def _put_selection(self):
+        if self._ions.selection.mass is not None:
+            self.choice.value = _OF_MASS
+        self._tell()
+        self._selected()
+
+    def _tell(self):
+        selection = self._ions.selection
+        number, of = len(self._ions.hits), len(self._ions.all)
+        peaks = [] if self.named is None else [peak for peak in self.named.peaks if peak.formula == selection.element]
+        intervals = [interval for peak in peaks for interval in peak.intervals]
+        if selection.mass is not None:
+            intervals = [selection.mass]
+        where = ", ".join(f"{low or 0:.4g} to {high or np.inf:.4g}" for low, high in intervals)
+        self.told.text = f"{number:,} of {of:,} ions" + (f", {where} Da" if where else "")
+
+    def _save(self):
+        """Save the ranges of the named peaks; a file that exists is replaced only by a second click."""
+        if self.named is None:
+            return
+        path = self._path.absolute()
+        if path.exists() and not self._confirmed:
+            self._confirmed, self.save.label = True, f"replace {path.name}"
+            return
+        self._confirmed, self.save.label = False, "save ranges"
+        try:
+            write_rrng(path, self.named.ranges)
+            self.text.text = f"wrote {escape(str(path))}"
+        except (ValueError, OSError) as error:
+            self.text.text = escape(str(error))

@@ -1,0 +1,145 @@
+"""The page without a file: files of the folder, those that were opened last, an example, a place to drop one."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bokeh.layouts import column
+from bokeh.models import Button, CustomJS, Div, InlineStyleSheet, TextInput
+
+from apt_evap._common.files import replace_file
+from apt_evap.detection.projection import Projection
+from apt_evap.explore.recent_files import recent_files
+from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.maps.indexing.master_pattern import master_patterns
+
+RUNS, MEASUREMENTS = (".h5",), (".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
+"""Suffixes of files that can be opened."""
+EXAMPLE = "example_ni111.npz"
+"""File of the example, a map as nickel gives it; it is written when it is opened."""
+_MOST = 40  # files of a kind
+_UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
+_CARDS = ":host { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 24px; }"
+_CARD = """
+:host .bk-btn.bk-btn-default { text-align: left; border: none; background: transparent; padding: 6px 8px;
+  color: var(--ink); font-size: 14px; }
+:host .bk-btn.bk-btn-default:hover { background: var(--panel); color: var(--ink); }
+"""
+_DROP_STYLE = """
+:host { border: 2px dashed var(--edge); border-radius: 12px; padding: 28px; text-align: center; font-size: 16px; }
+:host(.over) { border-color: #2f6fb3; background: var(--panel); }
+"""
+# the browser sends a dropped file to the server, which puts it into its folder
+_DROP = """
+const told = text => { zone.text = text }
+const send = file => {
+  const query = new URLSearchParams(location.search)
+  query.set("name", file.name)
+  query.set("size", file.size)
+  const request = new XMLHttpRequest()
+  request.open("POST", "upload?" + query)
+  request.upload.onprogress = event => told(`copying ${file.name}: ${Math.round(100 * event.loaded / event.total)} %`)
+  request.onload = () => {
+    if (request.status == 200) { path.value = request.responseText } else { told(request.responseText) }
+  }
+  request.onerror = () => told("the explorer cannot be reached")
+  request.send(file)
+}
+document.addEventListener("dragover", event => event.preventDefault())
+document.addEventListener("drop", event => {
+  event.preventDefault()
+  if (event.dataTransfer.files.length) send(event.dataTransfer.files[0])
+})
+"""
+
+
+class StartPage:
+    """Widgets of the page without a file.
+
+    Parameters
+    ----------
+    open_file : callable
+        Opens a file.
+    """
+
+    def __init__(self, open_file: Callable[[str], None]) -> None:
+        self._open = open_file
+        self.dropped = TextInput(visible=False)
+        self.dropped.on_change("value", lambda attr, old, new: open_file(new))
+        self.zone = Div(
+            text="Drop a measured file or a run here", sizing_mode="stretch_width",
+            stylesheets=[InlineStyleSheet(css=_DROP_STYLE)],
+        )  # fmt: skip
+        self.drop = CustomJS(args={"zone": self.zone, "path": self.dropped}, code=_DROP)
+        """What the browser does when the page is there."""
+        self.buttons: dict[str, Button] = {}
+        folder = _files()
+        cards = [
+            self._card("Measurements in this folder", folder[0], "no .epos, .pos, .apt, .raw, .nxs or .npz"),
+            self._card("Runs in this folder", folder[1], "no .h5"),
+            self._card("Opened last", [path for path in recent_files() if Path(path).is_file()], "nothing yet"),
+            self._card("Example", [EXAMPLE], ""),
+        ]
+        hint = (
+            f"<b style='font-size: 22px'>What does this map show?</b><br>"
+            f"Open a measured file: its peaks are named, its crystal is found, and a simulation of the specimen is "
+            f"one button away. Files of <b>{escape(str(Path.cwd()))}</b>:"
+        )
+        self.column = column(
+            Div(text=hint, sizing_mode="stretch_width", styles={"font-size": "15px", "line-height": "1.7"}),
+            self.zone,
+            self.dropped,
+            column(*cards, sizing_mode="stretch_width", stylesheets=[InlineStyleSheet(css=_CARDS)]),
+            sizing_mode="stretch_width",
+            styles={"max-width": "1200px", "margin": "24px auto", "gap": "20px", "padding": "0 24px"},
+        )
+
+    def _card(self, title: str, paths: Sequence[str], empty: str) -> Any:
+        """Files of a kind, each of which a click opens."""
+        rows = []
+        for path in paths[:_MOST]:
+            label = "nickel [111], as an instrument would see it" if path == EXAMPLE else _label(path)
+            button = Button(label=label, sizing_mode="stretch_width", stylesheets=[InlineStyleSheet(css=_CARD)])
+            button.on_click(partial(self._open, path))
+            self.buttons[path] = button
+            rows.append(button)
+        more = len(paths) - _MOST
+        text = f"{more} more: type their names above" if more > 0 else "" if rows else empty
+        head = Div(text=f"<b>{title}</b>", styles={"font-size": "15px"})
+        return column(head, *rows, *([Div(text=f"<small>{text}</small>")] if text else []))
+
+
+def write_example() -> None:
+    """Write the map of the example to the current folder, unless it is there."""
+    path = Path(EXAMPLE)
+    if path.exists():
+        return
+    orientation = Orientation("Ni", axis=(1, 1, 1), rotation=20.0)
+    projection = Projection(25.0, (-3.0, 1.5))
+    counts = master_patterns("fcc")[0].map(orientation, projection, width=34.0, ions=80_000, rolled=0.5, seed=1)
+    with replace_file(path) as file:
+        np.savez_compressed(file, counts=counts.values, x_edges_mm=counts.x_edges, y_edges_mm=counts.y_edges)
+
+
+def files_to_open() -> list[str]:
+    """Files of the current folder and the folders in it that can be opened."""
+    return [path for kind in _files() for path in kind]
+
+
+def _files():
+    """Measurements and runs in the current folder and the folders in it."""
+    paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern)) if path.is_file()]
+    return tuple([str(path) for path in paths if path.suffix.lower() in kind] for kind in (MEASUREMENTS, RUNS))
+
+
+def _label(path):
+    """Path and size of a file."""
+    try:
+        size = Path(path).stat().st_size
+    except OSError:
+        return path
+    factor, unit = next(((factor, unit) for factor, unit in _UNITS if size >= factor), (1.0, "bytes"))
+    return f"{path}   ({size / factor:.3g} {unit})"

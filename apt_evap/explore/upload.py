@@ -1,0 +1,90 @@
+"""Files that a browser sends: they are put into the current folder, and replace nothing."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from bokeh.util.token import check_session_id_signature
+from tornado.web import HTTPError, RequestHandler, stream_request_body
+
+from apt_evap._common.files import replace_file
+from apt_evap._common.validation import short_text
+from apt_evap.explore.start_page import MEASUREMENTS, RUNS
+
+_LARGEST = 64 << 30  # bytes
+
+
+class _StoppedError(Exception):
+    """Error that ends a file before it is complete."""
+
+
+@stream_request_body
+class UploadHandler(RequestHandler):
+    """Handler of ``POST upload?bokeh-session-id=...&name=...&size=...``; the answer is the path of the file.
+
+    A file of this name and size that is in the folder is taken for the same one.
+    """
+
+    def initialize(self, key: bytes) -> None:
+        """Take the key of the sessions, which only the holder of the address of the page has."""
+        self._key = key
+        self._file: Any = None
+        self._writing: Any = None
+        self._refused = ""
+
+    def prepare(self) -> None:
+        """Check the request before its content arrives."""
+        session = self.get_query_argument("bokeh-session-id", "")
+        if not check_session_id_signature(session, secret_key=self._key, signed=True):
+            raise HTTPError(403)
+        connection: Any = self.request.connection
+        connection.set_max_body_size(_LARGEST)
+        name, size = self.get_query_argument("name"), self.get_query_argument("size")
+        self._path = Path(name)
+        if name != self._path.name or name in ("", ".", "..") or "\\" in name:
+            self._refused = f"a dropped file must have a plain name, got {short_text(name)}"
+        elif self._path.suffix.lower() not in (*RUNS, *MEASUREMENTS):
+            known = ", ".join((*MEASUREMENTS, *RUNS))
+            self._refused = f"a dropped file must be one of {known}, got {short_text(name)}"
+        elif self._path.exists():
+            if str(self._path.stat().st_size) != size:
+                self._refused = f"{short_text(name)} exists in this folder and has another size: rename one of them"
+        else:
+            self._guarded(self._begin)
+
+    def data_received(self, chunk: bytes) -> None:
+        """Write a part of the file."""
+        if self._file is not None:
+            self._guarded(partial(self._file.write, chunk))
+
+    def post(self) -> None:
+        """Answer when the file is complete."""
+        if self._writing is not None:
+            self._guarded(partial(self._end, None))
+        if self._refused:
+            self.set_status(409)
+            self.finish(self._refused)
+            return
+        self.finish(str(self._path))
+
+    def on_connection_close(self) -> None:
+        """Remove a file that is not complete."""
+        if self._writing is not None:
+            self._guarded(partial(self._end, _StoppedError("the browser has gone")))
+
+    def _begin(self):
+        self._writing = replace_file(self._path)
+        self._file = self._writing.__enter__()
+
+    def _end(self, error):
+        writing, self._writing, self._file = self._writing, None, None
+        writing.__exit__(None if error is None else type(error), error, None)
+
+    def _guarded(self, work):
+        """Do a part of the work; after an error nothing is written."""
+        try:
+            work()
+        except (OSError, _StoppedError) as error:
+            self._refused, self._file = str(error), None
+            if self._writing is not None:
+                self._guarded(partial(self._end, _StoppedError()))

@@ -1,0 +1,115 @@
+"""The start page of the explorer: files of the folder, files that were opened last, an example, and a dropped file."""
+
+from pathlib import Path
+from urllib.parse import urlencode
+
+import pytest
+
+import apt_evap as ae
+
+pytest.importorskip("bokeh")
+
+from bokeh.document import Document
+from bokeh.events import ButtonClick
+from bokeh.util.token import generate_session_id
+from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
+
+from apt_evap.explore.page import Page
+from apt_evap.explore.recent_files import recent_files, remember_file
+from apt_evap.explore.server import serve
+from apt_evap.explore.start_page import EXAMPLE, StartPage, write_example
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.epos", "b.raw", "run.h5", "notes.txt", "w.toml"):
+        (tmp_path / name).write_bytes(b"12345")
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "inside" / "c.npz").write_bytes(b"1")
+    (tmp_path / "folder.epos").mkdir()
+    return tmp_path
+
+
+def test_the_files_of_the_folder_are_opened(folder):
+    asked = []
+    remember_file("b.raw")
+    remember_file("gone.raw")
+    start = StartPage(asked.append)
+    names = ["a.epos", "b.raw", "inside/c.npz", "run.h5", str(folder / "b.raw"), EXAMPLE]
+    assert [Path(name) for name in start.buttons] == [Path(name) for name in names]
+    for button in start.buttons.values():
+        button._trigger_event(ButtonClick(button))
+    assert asked == list(start.buttons)
+    start.dropped.value = "d.epos"
+    assert asked[-1] == "d.epos"
+    page = Page(None, Document(), opened=lambda path, document: lambda: None)
+    assert set(page.start.buttons) == set(start.buttons)
+    page.document.validate()
+    page.close()
+
+
+def test_files_that_were_opened_last(folder, state_folder):
+    for number in range(10):
+        remember_file(f"{number}.epos")
+    remember_file("8.epos")
+    remember_file("two\nlines.epos")
+    names = [Path(path).name for path in recent_files()]
+    assert names == ["8.epos", "9.epos", *(f"{number}.epos" for number in range(7, 1, -1))]
+    assert all(Path(path).parent == folder for path in recent_files())
+    (state_folder / "apt_evap" / "recent_files.txt").write_bytes(b"\xff\xfe\x00")
+    assert recent_files() == []
+    (state_folder / "apt_evap" / "recent_files.txt").unlink()
+    (state_folder / "apt_evap").rmdir()
+    (state_folder / "apt_evap").write_text("a file")
+    remember_file("a.epos")  # cannot be written
+    assert recent_files() == []
+
+
+def test_the_example_is_a_map(folder):
+    write_example()
+    counts = ae.io.read_map(EXAMPLE)
+    assert counts.is_counts and abs(counts.values.sum() - 80_000) < 1_500
+    (folder / EXAMPLE).write_text("mine")
+    write_example()
+    assert (folder / EXAMPLE).read_text() == "mine"
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_a_dropped_file_is_put_into_the_folder(folder):
+    """Only by the holder of the address, only what can be opened, nowhere else, and in the place of no other file."""
+    server, url = serve(None, with_file=lambda path: (None, None))
+    base, session = url.split("/?bokeh-session-id=")
+    forged = generate_session_id(b"k" * 32, signed=True)
+    answers = []
+
+    async def send(name, content=b"abcdefg", session=session):
+        query = urlencode({"bokeh-session-id": session, "name": name, "size": len(content)})
+        request = HTTPRequest(f"{base}/upload?{query}", method="POST", body=content)
+        try:
+            answer = await AsyncHTTPClient().fetch(request)
+        except HTTPClientError as error:
+            answer = error.response
+        answers.append((answer.code, answer.body.decode()))
+
+    async def visit():
+        await send("new.epos", b"x" * 3_000_000)
+        await send("a.epos", b"54321")  # of the same size: taken for the same
+        await send("a.epos", b"1234567")
+        for name in ("../up.epos", "/tmp/up.epos", "..", "inside/up.epos", "c\\up.epos", "notes.md", ""):
+            await send(name)
+        await send("forged.epos", session=forged)
+        await send("stranger.epos", session="")
+
+    before = {path.name for path in folder.iterdir()}
+    try:
+        server.io_loop.run_sync(visit)
+    finally:
+        server.stop()
+    assert answers[0] == (200, "new.epos") and (folder / "new.epos").read_bytes() == b"x" * 3_000_000
+    assert answers[1] == (200, "a.epos") and (folder / "a.epos").read_bytes() == b"12345"
+    assert answers[2][0] == 409 and "another size" in answers[2][1]
+    assert [code for code, _ in answers[3:10]] == [409] * 7 and all("must" in text for _, text in answers[3:10])
+    assert [code for code, _ in answers[10:]] == [403, 403]
+    assert {path.name for path in folder.iterdir()} == before | {"new.epos"}
+    assert not (folder.parent / "up.epos").exists() and not (folder / "inside" / "up.epos").exists()
