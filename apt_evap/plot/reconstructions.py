@@ -159,7 +159,8 @@ def _density(ax: Axes, result):
 def _fractions(ax: Axes, result, names, species):
     near, _ = _core(result)
     depths = result.positions[near, 2]
-    edges = _sections(depths)
+    # sections of equally many ions: the first and last ones of equal width have few, because the cap is curved
+    edges = np.quantile(depths, np.linspace(0, 1, len(_sections(depths))))
     number = np.stack([np.histogram(depths[species[near] == index], edges)[0] for index in range(len(names))])
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = number / number.sum(axis=0)
@@ -182,4 +183,5 @@ def _composition(ax: Axes, names, species):
         )  # fmt: skip
     ax.set_yticks(places, [name.replace("$", r"\$") for name in names])
     ax.invert_yaxis()
-    ax.set(xlabel="fraction of all ions", xlim=(0, 1.6 * fraction.max()))
+    ax.set(xlabel="fraction of all ions", xlim=(0, 1.6 * fraction.max()))  # with room for the texts
+    ax.set_xticks([tick for tick in ax.get_xticks() if tick <= min(1.0, 1.6 * fraction.max())])

@@ -1,8 +1,11 @@
-"""Pictures of the page "How to find out what a map shows": a map with its answer, and the master patterns.
+"""Pictures of the page "How to find out what a map shows": a map with its answers, and the master patterns.
 
-python pictures.py
+python pictures.py [RUN.h5]
+
+The map is that of a simulated run, which is read from the file, or made and saved there; a minute of processor time.
 """
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +16,20 @@ import apt_evap as ae
 HERE = Path(__file__).parent
 
 
-def answer():
-    """A map of nickel, and its indexing."""
-    truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
-    pattern = ae.maps.master_patterns("fcc")[1]
-    measured = pattern.map(truth, ae.detection.Projection(60.0), width=80.0, ions=80_000, rolled=0.4)
-    ae.plot.indexing(ae.index(measured, "Ni"))[0].figure.savefig(HERE / "find_orientation.png", dpi=110)
+def answers(path):
+    """The map of a tilted nickel tip, undecided, and decided by a mark."""
+    if not path.exists():
+        nickel = ae.material("Ni")
+        size = {"apex_radius": 30 * nickel.a, "shank_length": 30 * nickel.a, "depth": 6 * nickel.a}
+        tip = ae.Tip(nickel, axis=(0.30, 0.54, 0.79), rotation=20.0, offset_seed=1, **size)
+        ae.Simulation(tip, seed=1).run(15_000).save(path)
+    instrument = ae.Instrument(field_of_view=130.0, efficiency=0.8, resolution=0.1)
+    emission = ae.RollUp(ae.TruncatedNormal(0.1, 0.1), probability=0.5)
+    measured = ae.load(path).at_evaporation_field().record(instrument, emission).within_circle(65.0).map(bins=64)
+    for name, marks in (("undecided", []), ("find_orientation", [(-36.0, 8.0, (0, 1, 1))])):
+        found = ae.index(measured, "Ni", scales=(90, 105), poles=marks)
+        print(found)
+        ae.plot.indexing(found)[0].figure.savefig(HERE / f"{name}.png", dpi=80)
 
 
 def patterns():
@@ -45,5 +56,5 @@ def patterns():
 
 
 if __name__ == "__main__":
-    answer()
+    answers(Path(sys.argv[1] if len(sys.argv) > 1 else "tilted.h5"))
     patterns()
