@@ -15,7 +15,7 @@ import numpy as np
 
 import apt_evap as ae
 
-PATTERNS = Path(__file__).parents[1] / "apt_evap" / "indexing" / "patterns"
+PATTERNS = Path(__file__).parents[1] / "apt_evap" / "maps" / "indexing" / "patterns"
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4  # eV, nm: see articles/common_rules
 JOBS = {  # element and radius [a]: number of tips, events before the first ion, ions of each tip
     ("Ni", 20): (6, 5_000, 14_000),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -30,7 +31,8 @@ WIDEST, NARROWEST = 45.0, 12.0
 LARGEST_ANGLE, LEAST_ANGLE = 60.0, 5.0
 """Half angles of the field of view that a scale may give [degrees]."""
 DIFFERENT = 6.0
-"""Angle between two orientations above which they are different results [degrees]."""
+"""Angle between two orientations, or between the half angles of the field of view at two scales, above which they are
+different results [degrees]."""
 DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
@@ -142,7 +144,7 @@ class Indexing:
     map : DetectorMap
         The map.
     candidates : tuple of Candidate
-        Different orientations, the best one first.
+        Different orientations, or scales of one orientation, the best one first.
     decided : bool
         Whether the map decides for the first candidate.
     reason : str
@@ -273,10 +275,11 @@ def index(
     the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
     of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
     neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
-    less. The map is `decided` if the margin to the next orientation that differs by more than 6 degrees is above 12.
-    Without marks of a user it also needs 4,000 ions and a score of a third, no such orientation may explain more than
-    0.8 of what the first one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that
-    no orientation explains, or that contradict the map, are named in the reason, and the map is not decided.
+    less. The map is `decided` if the margin to the next result is above 12: another orientation, by more than 6
+    degrees, or the same one at a scale that differs so much that the half angle of the field of view does. Without
+    marks of a user it also needs 4,000 ions and a score of a third, no such result may explain more than 0.8 of what
+    the first one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that no
+    orientation explains, or that contradict the map, are named in the reason, and the map is not decided.
     `Indexing.deciding_marks` says which mark would decide.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
@@ -339,7 +342,7 @@ def index(
         fits = inside or fits
     different: list[tuple[int, Refined]] = []
     for number, fit in fits:
-        if all(misorientation(fit.matrix, other.matrix, proper) > DIFFERENT for _, other in different):
+        if all(differ(fit, other, proper, disc.radius) for _, other in different):
             different.append((number, fit))
     n = check_count(candidates, "candidates", at_least=1)
     contradiction = contradictory_pair(marks, disc.centre, bounds)
@@ -352,6 +355,16 @@ def index(
         if rival:
             result = replace(result, decided=False, reason=f"a {rival} crystal explains the map better")
     return result
+
+
+def differ(first: Refined, second: Refined, proper: Floats, radius: float) -> bool:
+    """Whether two fits are different results: in orientation, or in the scale of the same orientation.
+
+    Scales count by the angle that they give to the rim of the disc. So a narrow field of view, which cannot tell them
+    precisely, need not.
+    """
+    apart = math.degrees(abs(radius / first.scale - radius / second.scale)) > DIFFERENT
+    return apart or misorientation(first.matrix, second.matrix, proper) > DIFFERENT
 
 
 def _evidence(fits):
@@ -459,12 +472,12 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
     elif decided and best <= next_best:
         reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
     elif decided:
-        reason = f"it explains more than any other orientation, {numbers}"
+        reason = f"it explains more than any other orientation or scale, {numbers}"
     elif margin > DECIDED:
-        reason = f"another orientation explains nearly as much: the first {numbers}"
+        reason = f"another orientation or scale explains nearly as much: the first {numbers}"
     else:
         alike = int(np.count_nonzero(evidence > evidence[0] - DECIDED))
-        reason = f"{alike} orientations explain the map about equally well, {numbers}"
+        reason = f"{alike} orientations or scales explain the map about equally well, {numbers}"
     return Indexing(measured, tuple(candidates), decided, reason)
 
 
