@@ -99,9 +99,11 @@ def form(metal, hops):
     slope, start = np.polyfit(hops["ratio"], phi, 1)
     ratio = hops["above_energy"] / hops["above_charge"] ** 2 / (hops["site_energy"] / hops["site_charge"] ** 2)
     cube = ae.material(metal).nearest_neighbour_distance ** 3 / ae.units.COULOMB  # F^2 d^3/k_e is an energy
-    return (f"alpha {np.median(alpha):.3g} F m^2 (spread {alpha.std() / alpha.mean():.3f}), over 4 pi epsilon_0 d^3 "
-            f"{np.median(alpha) / unit / cube:.4f}, phi {start:.2f} + {slope:.2f} x, self terms {np.median(ratio):.3f}, "
-            f"G over F^2 d^3/k_e {np.median(gains / field**2) / cube:.3f}")  # fmt: skip
+    return (
+        f"alpha {np.median(alpha):.3g} F m^2 (spread {alpha.std() / alpha.mean():.3f}), over 4 pi epsilon_0 d^3 "
+        f"{np.median(alpha) / unit / cube:.4f}, phi {start:.2f} + {slope:.2f} x, self terms {np.median(ratio):.3f}, "
+        f"G over F^2 d^3/k_e {np.median(gains / field**2) / cube:.3f}"
+    )
 
 
 def row(name, cells):
