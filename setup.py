@@ -24,13 +24,15 @@ DIRECTIVES = {
     "cdivision": True,
     "initializedcheck": False,
 }
-# APT_EVAP_ABI3=1 builds one wheel for Python 3.11 and later; it is not the default before its speed is measured.
+# APT_EVAP_ABI3=1 builds one wheel for Python 3.11 and later, as fast as the others: the wheels of a release.
 ABI3 = bool(os.environ.get("APT_EVAP_ABI3"))
 MACROS = [("Py_LIMITED_API", "0x030b0000")] * ABI3
 if sys.platform == "win32":
     MACROS.append(("MS_WIN64", ""))  # for the headers of CPython and GCC
 # -fno-math-errno lets sqrt vectorise (4-17 times); -ffp-contract=off keeps the bits the same on every processor.
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
+# for compiler and linker: of GCC and clang, and of Apple's clang with libomp in CPATH and LIBRARY_PATH (not run yet)
+OPENMP = [(["-fopenmp"], ["-fopenmp"]), (["-Xpreprocessor", "-fopenmp"], ["-lomp"])]
 
 
 def compiles(compiler, flags):
@@ -81,17 +83,21 @@ class BuildCore(build_ext):
             )
         compiler = getattr(self.compiler, "compiler", None)
         if compiler:
-            openmp = [] if os.environ.get("APT_EVAP_SERIAL") else ["-fopenmp"]
-            if openmp and not compiles(compiler, openmp):
-                warnings.warn("the compiler has no OpenMP: apt_evap is built for one thread", stacklevel=1)
-                openmp = []
+            openmp, link = [], []
+            if not os.environ.get("APT_EVAP_SERIAL"):
+                for openmp, link in OPENMP:
+                    if compiles(compiler, [*openmp, *link]):
+                        break
+                else:
+                    openmp, link = [], []
+                    warnings.warn("the compiler has no OpenMP: apt_evap is built for one thread", stacklevel=1)
             simd = ["-fopenmp-simd"] if not openmp and compiles(compiler, ["-fopenmp-simd"]) else []
             # debug symbols, which Python's own -g asks for, are four fifths of the size; with -g in CFLAGS they stay
             wanted = "-g" in os.environ.get("CFLAGS", "").split()
             bare = ["-g0"] if not wanted and compiles(compiler, ["-g0"]) else []
             for extension in self.extensions:
                 extension.extra_compile_args = [*FLAGS, *openmp, *simd, *bare]
-                extension.extra_link_args = [*openmp]
+                extension.extra_link_args = [*link]
         self.parallel = self.parallel or os.cpu_count()
         super().build_extensions()
 

@@ -122,7 +122,9 @@ example)
     windows_python -m apt_evap.cli info "Z:$folder/ni111.h5" | grep -i fingerprint
     ;;
 test)
-    windows_python -m pytest -n 0 -p no:cacheprovider -ra "$@"
+    # this CPython ignores PYTHONPATH, so that a test cannot put a module in place of another
+    windows_python -m pytest -n 0 -p no:cacheprovider -ra "$@" \
+        --deselect tests/cli/test_streams.py::test_ctrl_c_while_libraries_are_loaded
     ;;
 python)
     windows_python "$@"

@@ -16,6 +16,7 @@ from apt_evap._common.types import AnyPath
 
 _UNFINISHED = re.compile(r"\..{0,40}\.[0-9a-f]{16}\.part", re.DOTALL)  # names of temporary files
 _ABANDONED_AFTER = 3600.0  # seconds since the last byte was written
+_RENAMES, _PAUSE = 40, 0.05  # seconds between two tries to rename a file on Windows
 _WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
 
 
@@ -155,7 +156,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())  # the bytes must be on the disk before the name, in case of a power cut
         if mode is not None:
             part.chmod(mode)
-        os.replace(part, target)
+        _rename(part, target)
         part = None
         flush_folder(target.parent)
     except OSError as error:
@@ -164,6 +165,15 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
         if part is not None:
             with suppress(OSError):
                 part.unlink()
+
+
+def _rename(part, target):
+    """Rename a file; Windows refuses that while somebody reads the target, which is waited for."""
+    for _ in range(_RENAMES if sys.platform == "win32" else 0):
+        with suppress(PermissionError):
+            return os.replace(part, target)
+        time.sleep(_PAUSE)
+    return os.replace(part, target)
 
 
 def open_regular(path: AnyPath, flags: int) -> int:

@@ -154,7 +154,8 @@ cdef class ConstantPotential(FieldRule):
         charges, chosen = tree.charges.copy(), lists.slots
         image = self.multiply(self.sums, charges, double_precision, n_threads)
         if lists.disturbed is None:
-            multiple = potential * charges.sum() / dot(charges[chosen], image)   # the one with the smallest error
+            # the one with the smallest error
+            multiple = potential * elementary.total(charges) / dot(charges[chosen], image)
             charges *= multiple
             image *= multiple
 
@@ -162,8 +163,8 @@ cdef class ConstantPotential(FieldRule):
         residuals = potential - image
         while True:
             change = np.zeros(len(chosen))
-            sweeps, residual = self.correct(rough, change, residuals, charges.sum() / n, tolerance, sweeps, max_sweeps,
-                                            double_precision, n_threads)
+            sweeps, residual = self.correct(rough, change, residuals, elementary.total(charges) / n, tolerance, sweeps,
+                                            max_sweeps, double_precision, n_threads)
             charges[chosen] += change
             if residual < tolerance or sweeps >= max_sweeps:
                 break
@@ -314,7 +315,8 @@ cdef class ConstantPotential(FieldRule):
                             total += q[k] * self.sums.difference(squares[k])
                 missing[i, j] = self.potential - total
         at_atom, near = np.asarray(missing)[:, 0], np.asarray(missing)[:, 1:].mean(axis=1)
-        return (at_atom - near) / (self.self_term * charges.mean()) + near / self.potential
+        mean = elementary.total(charges) / len(charges)
+        return (at_atom - near) / (self.self_term * mean) + near / self.potential
 
     cdef void squared_distances(self, const double[:, ::1] atoms, Index atom, double[::1] squares) noexcept nogil:
         cdef Index k

@@ -9,7 +9,7 @@ from libc.math cimport M_PI, fabsf, sqrt
 
 import numpy as np
 
-from apt_evap._core import interactions
+from apt_evap._core import elementary, interactions
 
 from apt_evap._core.index cimport Index
 from apt_evap._core.octree cimport Octree
@@ -108,13 +108,13 @@ cdef class Robin(FieldRule):
         else:
             others[:] = tree.atoms >= 0
             others[lists.slots] = False
-        before = tree.charges[others].sum()
+        before = elementary.total(tree.charges[others])
         outcome = self.iterate(tree, normals, lists, tolerance=tolerance, max_sweeps=max_sweeps,
                                double_precision=double_precision, n_threads=n_threads)
-        self.scale(tree, potential / (tree.charges / self.keep_inside(tree)).sum())
+        self.scale(tree, potential / elementary.total(tree.charges / self.keep_inside(tree)))
         self.inner, self.potential, self.drift = self.point.ravel(), potential, 0.0
         if before > 0.0:
-            self.far_scale *= tree.charges[others].sum() / before
+            self.far_scale *= elementary.total(tree.charges[others]) / before
         return outcome
 
     def scale(self, Octree tree, double factor):
@@ -150,7 +150,7 @@ cdef class Robin(FieldRule):
         """
         field = interactions.direct_field(positions[chosen], positions, charges)
         settled = self.area / (2 * np.pi) * (field * normals[chosen]).sum(axis=1)
-        return (settled - charges[chosen]) / charges.mean()
+        return (settled - charges[chosen]) / (elementary.total(charges) / len(charges))
 
     @cython.wraparound(True)
     def iterate(self, Octree tree, const double[:, ::1] normals, InteractionLists lists, *, double tolerance=1e-6,
@@ -188,7 +188,7 @@ cdef class Robin(FieldRule):
         if lists.disturbed is None:
             self.field = np.zeros((tree.x.shape[0], 3))
         charges = tree.charges
-        total = charges.sum()
+        total = elementary.total(charges)
         maps, steps = [], []   # results of the last sweeps of Robin's iteration, and their changes
         while sweeps < max_sweeps:
             sweeps += 1
@@ -201,10 +201,11 @@ cdef class Robin(FieldRule):
                 self.scale_others(tree, lists, np.divide(after, before, unknown, where=before > 0.0))
             # Robin's equation q_i = (s/2 pi) E_i . n_i, with the area s per atom that conserves the total charge
             flux = np.maximum(self.normal_field(tree, normals), 0.0)   # a site deep in a notch has no charge
-            if not flux.sum() > 0.0:
+            emitted = elementary.total(flux)
+            if not emitted > 0.0:
                 raise ValueError(f"the total charge of {n} surface atoms is not positive: normals must point outwards")
-            self.area = 2.0 * M_PI * total / flux.sum()
-            flux *= total / flux.sum()
+            self.area = 2.0 * M_PI * total / emitted
+            flux *= total / emitted
             maps.append(flux)
             steps.append(flux - charges)
             residual = np.abs(steps[-1]).max() * n / total
@@ -213,7 +214,7 @@ cdef class Robin(FieldRule):
                 break
             # next charges from the last sweeps, none of them negative
             mixed = np.maximum(self.mixed(maps, steps), 0.0)
-            mixed *= total / mixed.sum()
+            mixed *= total / elementary.total(mixed)
             tree.charges = mixed
         return sweeps, residual
 

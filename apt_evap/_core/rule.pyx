@@ -4,6 +4,8 @@ from libc.math cimport M_PI, sqrt
 
 import numpy as np
 
+from apt_evap._core import elementary
+
 from apt_evap._core.index cimport Index
 from apt_evap._core.interactions cimport InteractionLists
 from apt_evap._core.octree cimport Octree
@@ -262,7 +264,7 @@ cdef class PythonRule(FieldRule):
         self.area = area
         before = tree.charges.copy()
         field_of(charges)
-        change = float(np.abs(charges - before).max() / charges.mean())
+        change = float(np.abs(charges - before).max() / (elementary.total(charges) / n))
         return 1, min(change, 0.5 * tolerance)   # the rule itself decides when to stop
 
     @property

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -38,6 +39,8 @@ def _to_stdout() -> Iterator[None]:
     except BrokenPipeError:
         raise
     except OSError as error:
+        if sys.platform == "win32" and error.errno == errno.EINVAL:  # what Windows says of a closed pipe
+            raise BrokenPipeError from error
         discard_stdout()
         raise OSError(f"cannot write to the standard output: {error.strerror or error}") from error
 
@@ -62,8 +65,9 @@ def flush() -> None:
 
 def say(kind: str, message: object) -> None:
     """Print one line on stderr: an error, a warning or a note."""
+    text = str(message).replace("\\\\", "\\") if os.sep == "\\" else str(message)  # paths as they are typed
     with contextlib.suppress(OSError):  # stderr is closed
-        print(f"apt-evap: {kind}:", *str(message).split(), file=sys.stderr, flush=True)
+        print(f"apt-evap: {kind}:", *text.split(), file=sys.stderr, flush=True)
 
 
 def tell(options: argparse.Namespace, line: str) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from apt_evap._common.small_matrices import lengths
 from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
-from apt_evap._core.elementary import sine_and_cosine
+from apt_evap._core.elementary import sine_and_cosine, total
 
 HALF_ANGLE = 45.0  # degrees from the axis: about what an instrument sees, and far from the shank
 _FEWEST = 12  # surface atoms: three times the unknowns of the sphere
@@ -74,6 +74,6 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
         from_centre = positions[above] - centre
         chosen = above[from_centre[:, 2] >= cosine * lengths(from_centre)]
     fields = fields[chosen]
-    weights = fields / fields.sum()  # fields are proportional to charges
-    ratio = float((weights * fields / evaporation_fields[chosen]).sum())
-    return Cap(float((weights * fields).sum()), ratio, radius, float(centre[2]) + radius)
+    weights = fields / total(fields)  # fields are proportional to charges
+    ratio = total(weights * fields / evaporation_fields[chosen])
+    return Cap(total(weights * fields), ratio, radius, float(centre[2]) + radius)

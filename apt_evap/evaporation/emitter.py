@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
+from inspect import cleandoc
 from textwrap import fill, indent
 from typing import Any, TypeVar
 
@@ -55,7 +56,8 @@ def _with_columns(cls: type[T]) -> type[T]:
             shape = ("n", *column.row)
             entries += f"{column.name} : ndarray{kind}{unit}, shape {shape}\n".replace("'", "")
             entries += indent(fill(column.meaning, 110), "    ") + "\n"
-    cls.__doc__ = (cls.__doc__ or "").replace("    journal :", f"{indent(entries, '    ')}    journal :", 1)
+    # Python 3.13 removes the indentation of docstrings itself
+    cls.__doc__ = cleandoc(cls.__doc__ or "").replace("\njournal :", f"\n{entries}journal :", 1)
     return cls
 
 

@@ -15,7 +15,7 @@ from apt_evap._common.codec import checked, choice, count, from_plain, number, p
 from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_seed, short_text
-from apt_evap._core.elementary import logarithm
+from apt_evap._core.elementary import logarithm, total
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, PostIonisation
 from apt_evap.evaporation.voltage import VoltageControl
@@ -135,6 +135,10 @@ def random_of(seed: int, ions: Integers) -> Floats:
     return IonRandom((seed + _SEED_STEP) % (1 << 64), ions).uniform(_COLUMNS)
 
 
+def _mean(values):
+    return total(values) / len(values) if len(values) else np.nan
+
+
 def trailing_mean(values: Floats, n: int) -> Floats:
     """Mean of each value and its n - 1 predecessors; of all predecessors for the first ones."""
     if n == 1:
@@ -199,14 +203,14 @@ def real_voltages(
             "field_reference 'cap' needs the mean field of the cap, which this run does not contain: too few of "
             "its surface atoms are around the axis; use field_reference='site'"
         )
-    field_ratio = float(np.mean(site_ratios / cap_ratios)) if known.any() and len(ions) else None
+    field_ratio = _mean(site_ratios / cap_ratios) if known.any() and len(ions) else None
     ratios = cap_ratios if field_reference == "cap" else site_ratios
     if controlled is None:
         goal = 1.0 if operating_ratio is None else operating_ratio
         return trailing_mean(voltage * goal / ratios, smoothing), goal, field_ratio
-    reached = float(np.mean(site_ratios * controlled)) / voltage
+    reached = _mean(site_ratios * controlled) / voltage
     goal = reached if operating_ratio is None else operating_ratio
-    scale = goal / (float(np.mean(ratios * controlled)) / voltage)
+    scale = goal / (_mean(ratios * controlled) / voltage)
     return trailing_mean(scale * controlled, smoothing), goal, field_ratio
 
 
@@ -345,7 +349,7 @@ def real_units_of(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColum
     u = random_of(seed, emissions.ions)
     # fields at the evaporations, about their mean, which is the operating field
     local = run.fields * voltages / evaporation_fields
-    local = local / (local.mean() or 1.0) * goal if len(run) else local
+    local = local / (_mean(local) or 1.0) * goal if len(run) else local
     fields = local * evaporation_fields
     operating_field = goal * host_field
     real = RealColumns(

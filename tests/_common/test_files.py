@@ -2,6 +2,7 @@
 
 import os
 import stat
+import sys
 import threading
 import time
 
@@ -161,6 +162,24 @@ def test_a_file_is_closed_before_it_is_renamed(tmp_path, monkeypatch):
     with replace_file(tmp_path / "a.png") as file:
         opened.append(file)
     assert names(tmp_path) == ["a.png"]
+
+
+def test_a_file_that_is_read_is_renamed_later_on_windows(tmp_path, monkeypatch):
+    tries, replace = [], os.replace
+
+    def refuse(source, target):
+        tries.append(target)
+        if len(tries) < 3:
+            raise PermissionError(13, "Access is denied")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    with pytest.raises(FileError, match=r"cannot write .*a\.png': Access is denied"):
+        write(tmp_path / "a.png")
+    assert len(tries) == 1 and names(tmp_path) == []
+    monkeypatch.setattr(sys, "platform", "win32")
+    write(tmp_path / "a.png")
+    assert len(tries) == 3 and names(tmp_path) == ["a.png"]
 
 
 def test_a_full_disk_is_one_sentence_and_leaves_nothing(tmp_path):

@@ -13,6 +13,7 @@ from apt_evap._core.elementary import (
     normal_quantile,
     seventh_root_of_reciprocal,
     sine_and_cosine,
+    total,
 )
 
 
@@ -57,3 +58,26 @@ def test_quantile_of_the_normal_distribution(rng):
     assert normal_quantile(p) == pytest.approx(scipy.special.ndtri(p), rel=3e-15, abs=0)
     assert normal_quantile([0.0, 0.5, 1.0]).tolist() == [-np.inf, 0.0, np.inf]
     assert np.isnan(normal_quantile([np.nan, -0.1, 1.1])).all()
+
+
+def pairwise(numbers):
+    """Sum in the order of the definition: halves, and up to 128 numbers in eight sums."""
+    n = len(numbers)
+    if n > 128:
+        half = n // 2 - n // 2 % 8
+        return pairwise(numbers[:half]) + pairwise(numbers[half:])
+    sums, whole = np.zeros(8), n - n % 8
+    for row in numbers[:whole].reshape(-1, 8):
+        sums += row
+    result = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]))
+    for number in numbers[whole:]:
+        result += number
+    return result
+
+
+@pytest.mark.parametrize("n", [0, 1, 7, 8, 127, 129, 1000, 8191, 8193, 20_001, 300_007])
+def test_total_has_one_order(rng, n):
+    numbers = 10 ** rng.uniform(-3, 3, n) * rng.choice((-1, 1), n)
+    assert total(numbers) == pairwise(numbers)
+    assert total(numbers) == pytest.approx(math.fsum(numbers), rel=1e-13, abs=1e-9)
+    assert total(np.repeat(numbers, 2)[::2]) == total(numbers)

@@ -59,7 +59,7 @@ def failed(capsys, *arguments):
     out, err = capsys.readouterr()
     assert out == "" and re.fullmatch(r"(apt-evap: warning: [^\n]+\n)*apt-evap: error: [^\n]+\n", err)
     assert sorted(str(path) for path in Path().rglob("*")) == before
-    return err
+    return err.replace(os.sep, "/")
 
 
 @MODES

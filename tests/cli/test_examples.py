@@ -36,7 +36,7 @@ def test_the_list_has_a_title_for_each(capsys):
 
 def test_copies_are_the_originals_and_can_be_run(folder, capsys):
     assert main(["examples", "--to", "a/b"]) == 0
-    assert capsys.readouterr().out == f"wrote {len(originals())} files to a/b\n"
+    assert capsys.readouterr().out == f"wrote {len(originals())} files to {Path('a/b')}\n"
     assert {path.name: path.read_bytes() for path in Path("a/b").iterdir()} == originals()
     assert tomllib.loads(Path("a/b/ni111.toml").read_text())["tip"]["material"] == "Ni"
 
@@ -46,7 +46,10 @@ def test_changed_files_are_kept(folder, capsys):
     Path("here/ni111.toml").write_text("mine")
     Path("here/measured_map.py").unlink()
     assert main(["examples", "--to", "here"]) == 2
-    assert "'here/ni111.toml' exists and differs from the example: --force overwrites it" in capsys.readouterr().err
+    assert (
+        f"'{Path('here/ni111.toml')}' exists and differs from the example: --force overwrites it"
+        in capsys.readouterr().err
+    )
     assert Path("here/ni111.toml").read_text() == "mine" and not Path("here/measured_map.py").exists()
     assert main(["examples", "--to", "here", "--force", "--quiet"]) == 0
     assert {path.name: path.read_bytes() for path in Path("here").iterdir()} == originals()
@@ -63,7 +66,7 @@ def test_a_pipe_is_refused(folder, capsys):
 def test_what_is_refused(folder, capsys, monkeypatch):
     Path("file").touch()
     assert main(["examples", "--to", "file"]) == 2
-    assert "cannot write to 'file': File exists" in capsys.readouterr().err
+    assert "cannot write to 'file': " in capsys.readouterr().err
     monkeypatch.setattr(examples, "_PLACES", (folder / "none",))
     assert main(["examples"]) == 2
     assert "the examples are not in" in capsys.readouterr().err

@@ -76,7 +76,7 @@ def failed(capsys, *arguments):
     out, err = capsys.readouterr()
     assert out == "" and re.fullmatch(r"apt-evap: error: [^\n]+\n", err)
     assert sorted(os.listdir()) == before
-    return err
+    return err.replace(os.sep, "/")
 
 
 # ---- run -------------------------------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ def test_wrong_configs_are_one_sentence(folder, made, capsys):
     assert "GB are free; give a depth" in wrong("6 a", "90000 a")
     assert "'wrong.toml' is not a TOML file" in wrong("=", ":")
     assert "cannot read 'none.toml'" in failed(capsys, "run", "none.toml")
-    assert f"'{made}' is a run: see apt-evap info" in failed(capsys, "run", made)
+    assert f"'{made.as_posix()}' is a run: see apt-evap info" in failed(capsys, "run", made)
 
 
 @NO_PICTURES

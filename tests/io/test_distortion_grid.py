@@ -10,7 +10,7 @@ ROWS = [(10.0 * i + 0.3 * j, 10.0 * j, float(i), float(j)) for i in range(4) for
 
 
 def write(path, rows, header="detectorX,detectorY,gridX,gridY"):
-    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n", encoding="utf-8")
     return path
 
 
