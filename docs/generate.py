@@ -30,14 +30,14 @@ HERE = Path(__file__).parent
 _THUMBNAILS = {
     "map_an_epos": ("articles/common_rules/common_rules.png", (0.335, 0.03, 0.64, 0.49)),
     "mass_spectrum": ("docs/howto/mass_spectrum.png", (0.0, 0.0, 1.0, 1.0)),
-    "find_orientation": ("articles/find_the_poles/find_orientation.png", (0.53, 0.13, 1.0, 0.9)),
+    "find_orientation": ("articles/find_the_poles/find_orientation.png", (0.5, 0.06, 1.0, 0.5)),
     "simulate_my_specimen": ("articles/three_metals/three_metals.png", (0.05, 0.03, 0.36, 0.93)),
     "fit_energies": ("articles/hidden_energies/figure3.png", (0.5, 0.0, 1.0, 1.0)),
     "find_radius": ("articles/three_metals/three_metals.png", (0.61, 0.03, 0.88, 0.48)),
     "reconstruct": ("articles/small_specimens/superalloy.png", (0.0, 0.54, 0.47, 1.0)),
     "correct_distortion": ("articles/origins/origins.png", (0.0, 0.0, 0.33, 1.0)),
     "own_structure": ("docs/howto/own_structure.png", (0.0, 0.0, 0.62, 1.0)),
-    "precipitate_or_boundary": ("docs/howto/precipitate_or_boundary.png", (0.33, 0.0, 1.0, 0.5)),
+    "precipitate_or_boundary": ("docs/howto/precipitate_or_boundary.png", (0.365, 0.0, 1.0, 0.5)),
     "visibility": ("articles/find_the_precipitate/find_the_precipitate.png", (0.34, 0.0, 1.0, 0.5)),
     "real_units": ("articles/microscope/course.png", (0.0, 0.0, 1.0, 1.0)),
     "explore": ("docs/howto/explore.png", (0.0, 0.0, 1.0, 1.0)),
@@ -47,7 +47,7 @@ _THUMBNAILS = {
     "resume": ("docs/soak.png", (0.0, 0.0, 1.0, 1.0)),
     "from_python": ("docs/ni111.png", (0.5, 0.1, 0.92, 1.0)),
     "convert_files": ("articles/small_specimens/superalloy.png", (0.0, 0.0, 0.44, 0.5)),
-    "atlas": ("articles/find_the_poles/master_patterns.png", (0.22, 0.53, 0.435, 0.98)),
+    "atlas": ("articles/find_the_poles/master_patterns.png", (0.22, 0.548, 0.435, 0.98)),
 }
 
 
