@@ -30,7 +30,7 @@ HERE = Path(__file__).parent
 _THUMBNAILS = {
     "map_an_epos": ("articles/common_rules/common_rules.png", (0.335, 0.03, 0.64, 0.49)),
     "mass_spectrum": ("docs/howto/mass_spectrum.png", (0.0, 0.0, 1.0, 1.0)),
-    "find_orientation": ("articles/find_the_poles/find_orientation.png", (0.53, 0.15, 1.0, 0.9)),
+    "find_orientation": ("articles/find_the_poles/find_orientation.png", (0.5, 0.06, 1.0, 0.5)),
     "simulate_my_specimen": ("articles/three_metals/three_metals.png", (0.05, 0.03, 0.36, 0.93)),
     "fit_energies": ("articles/hidden_energies/figure3.png", (0.5, 0.0, 1.0, 1.0)),
     "find_radius": ("articles/three_metals/three_metals.png", (0.61, 0.03, 0.88, 0.48)),

@@ -258,9 +258,9 @@ def check_kind(value: Any, name: str, kind: Any, expected: str) -> Any:
 
 
 def check_name(value: Any, name: str) -> str:
-    """Return `value` if it is a text of 1 to 100 characters: names are used in messages, titles and files."""
-    if not isinstance(value, str) or not 1 <= len(value) <= _LONGEST_NAME:
-        raise ValueError(f"{name} must be text of 1 to {_LONGEST_NAME} characters, got {short_text(value)}")
+    """Return `value` if it is a line of 1 to 100 characters: names are used in messages, titles and files."""
+    if not isinstance(value, str) or not 1 <= len(value) <= _LONGEST_NAME or not value.isprintable():
+        raise ValueError(f"{name} must be text of 1 to {_LONGEST_NAME} printable characters, got {short_text(value)}")
     return value
 
 

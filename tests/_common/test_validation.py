@@ -115,7 +115,7 @@ CHECKS = {
     "word": (partial(check_choice, known=("low", "high")), [None, True, 3, NAN, [], b"x", "", "lower", "Low"]),
     "hits": (partial(check_kind, kind=ae.Hits, expected="Hits"), [None, True, "x", 0, {}, object(), dict, ae.Hits]),
     "save": (partial(check_kind, kind="save", expected="a run"), [None, "x", object(), ae.Run]),
-    "title": (check_name, [None, True, 3, NAN, [], b"x", "", "x" * 101]),
+    "title": (check_name, [None, True, 3, NAN, [], b"x", "", "x" * 101, "a\nb", "a\tb", "\x1b[1m", "\u2028", "\ud800"]),
     "items": (partial(check_sequence, expected="numbers"), [None, True, 3, NAN, "x", b"x", {}, object()]),
     "pairs": (partial(check_pairs, expected="a mapping"), [None, True, "x", 3, NAN, [1], [(1, 2, 3)], object()]),
     "vector": (
