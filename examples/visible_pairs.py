@@ -1,8 +1,9 @@
 """
-Pairs of solutes, an analysis for ``apt-evap visible``
-======================================================
+Pairs of solutes, the analysis of visible.toml
+==============================================
 
-``visible.toml`` names the function of this file. It counts the pairs of copper ions that are closer than 0.6 nm.
+`apt-evap visible` calls the function of this file for every twin. It counts the pairs of copper ions that are closer
+than 0.6 nm.
 """
 
 from scipy.spatial import cKDTree
