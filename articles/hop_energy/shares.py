@@ -91,7 +91,7 @@ CHOICES = {
 
 
 def form(metal, hops):
-    """Gain as alpha F^2 (phi^2 - 1)/2, with F at the site: alpha, its spread, phi over the charge ratio, self terms."""
+    """Gain as alpha F^2 (phi^2 - 1)/2, F at the site: alpha, its spread, phi over the charge ratio, self terms."""
     gains, field = hops["above_energy"] - hops["site_energy"], hops["field"]
     phi = hops["above_charge"] / hops["site_charge"]
     unit = 1e-18 * ae.units.ELEMENTARY_CHARGE  # e nm^2/V to F m^2
@@ -99,11 +99,14 @@ def form(metal, hops):
     slope, start = np.polyfit(hops["ratio"], phi, 1)
     ratio = hops["above_energy"] / hops["above_charge"] ** 2 / (hops["site_energy"] / hops["site_charge"] ** 2)
     cube = ae.material(metal).nearest_neighbour_distance ** 3 / ae.units.COULOMB  # F^2 d^3/k_e is an energy
-    return (
-        f"alpha {np.median(alpha):.3g} F m^2 (spread {alpha.std() / alpha.mean():.3f}), over 4 pi epsilon_0 d^3 "
-        f"{np.median(alpha) / unit / cube:.4f}, phi {start:.2f} + {slope:.2f} x, self terms {np.median(ratio):.3f}, "
-        f"G over F^2 d^3/k_e {np.median(gains / field**2) / cube:.3f}"
+    parts = (
+        f"alpha {np.median(alpha):.3g} F m^2 (spread {alpha.std() / alpha.mean():.3f})",
+        f"over 4 pi epsilon_0 d^3 {np.median(alpha) / unit / cube:.4f}",
+        f"phi {start:.2f} + {slope:.2f} x",
+        f"self terms {np.median(ratio):.3f}",
+        f"G over F^2 d^3/k_e {np.median(gains / field**2) / cube:.3f}",
     )
+    return ", ".join(parts)
 
 
 def row(name, cells):
