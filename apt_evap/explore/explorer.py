@@ -239,6 +239,14 @@ class Explorer:
             self.measured = self.ions_of_file.hits
             self._kept_maps, self._kept_picture = {}, (None, None)
 
+    def keep_ions(self, other: "Explorer") -> None:
+        """Keep the selection of ions of another explorer, if it has the same measurement."""
+        if isinstance(other.ions_of_file, MeasuredIons) and other.names[1] == self.names[1]:
+            self.ions_of_file = other.ions_of_file
+            self.selection_changed()
+            if self.is_comparison and not self.registered:
+                self.registration = self._same_size()
+
     @property
     def names(self) -> tuple[str, str]:
         """Files of the run and of the measurement, empty without one."""
