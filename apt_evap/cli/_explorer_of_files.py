@@ -21,6 +21,7 @@ from apt_evap.fit.start_settings import is_start
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.specimen.materials import MATERIALS
 
 
 def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, ExplorerSettings | None]:
@@ -91,6 +92,8 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
+    if options.element is not None and (name := read_material(options.element, "--element").name) in MATERIALS:
+        explorer.crystal = name
     start = explorer.start
     bins = options.bins or start.bins
     view = ExplorerSettings(

@@ -223,6 +223,8 @@ class Explorer:
         self.registered = registration is not None
         """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
+        self.crystal = ""
+        """Name of the crystal of the measurement, if it is known and one of the table."""
         self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
         if run is not None and measured is not None and registration is None:

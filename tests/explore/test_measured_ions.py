@@ -98,6 +98,26 @@ def test_numbers_of_ions_are_those_of_the_file(hits, monkeypatch):
     assert np.array_equal(names["measured"].x, expected.x)
 
 
+def test_the_command_names_the_crystal(tmp_path, monkeypatch):
+    pytest.importorskip("bokeh")
+    from bokeh.document import Document
+
+    from apt_evap.explore.page import Page
+
+    monkeypatch.chdir(tmp_path)
+    edges = np.linspace(-20.0, 20.0, 41)
+    counts = np.random.default_rng(1).poisson(20.0, (40, 40))
+    np.savez("map.npz", counts=counts, x_edges_mm=edges, y_edges_mm=edges)
+    explorer, view = explorer_and_view(make_parser().parse_args(["explore", "map.npz", "--element", "Ni"]))
+    page = Page(explorer, Document(), view, later=lambda function, delay: None)
+    assert page.index.material.value == "Ni" and "111" in page.index.family.options
+    page.close()
+    explorer, _ = explorer_and_view(make_parser().parse_args(["explore", "map.npz"]))
+    assert explorer.crystal == ""
+    with pytest.raises(ValueError, match="--element"):
+        explorer_and_view(make_parser().parse_args(["explore", "map.npz", "--element", "Xy"]))
+
+
 def test_what_cannot_be_selected(hits):
     ions = MeasuredIons(hits)
     ions.select(IonSelection(mass=(10.0, 20.0)))
