@@ -1,8 +1,11 @@
 """Explorer of the files of `apt-evap explore`, by its options, and the same as text."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from apt_evap._common.codec import to_python
 from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration, with_masses
@@ -13,11 +16,12 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
-from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
+from apt_evap.explore.measured_ions import NUMBERED, IonSelection, MeasuredIons
 from apt_evap.fit.start_settings import is_start
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.specimen.materials import MATERIALS
 
 
 def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, ExplorerSettings | None]:
@@ -88,6 +92,8 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         run_arguments=[] if run is None else _run_arguments(options),
         measured_arguments=[] if options.file is None else _measured_arguments(options),
     )
+    if options.element is not None and (name := read_material(options.element, "--element").name) in MATERIALS:
+        explorer.crystal = name
     start = explorer.start
     bins = options.bins or start.bins
     view = ExplorerSettings(
@@ -135,7 +141,8 @@ def _measured(options):
     if isinstance(content, DetectorMap):
         return content
     # the masses of species are those of the options; others follow the spectrum
-    hits = content if options.species is None else with_masses(content, options)
+    hits = content if content.ion is not None else replace(content, ion=np.arange(len(content)))
+    hits = hits if options.species is None else with_masses(hits, options)
     fresh = argparse.Namespace(**(vars(options) | {"mass": None, "ions": None}))
     element = None if options.element is None else read_material(options.element, "--element").name
     chosen = options.all_ions or options.mass is not None or options.species is not None
@@ -198,7 +205,7 @@ def _measured_code(options):
     parameters = {
         name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
     } | ({"detector_unit": options.unit} if options.unit else {})
-    code = f"ae.read({_call(options.file, parameters)})"
+    code = f"ae.read({_call(options.file, parameters)}){NUMBERED}"
     if options.species is not None and options.distance is not None:
         code += f".with_masses({options.distance!r}, {options.time_zero!r})"
     for name, column in _SELECTION.items():

@@ -223,6 +223,8 @@ class Explorer:
         self.registered = registration is not None
         """Whether the registration was found or given, not only set to show both maps in the same size."""
         self.registration = registration
+        self.crystal = ""
+        """Name of the crystal of the measurement, if it is known and one of the table."""
         self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
         if run is not None and measured is not None and registration is None:
@@ -238,6 +240,14 @@ class Explorer:
         if isinstance(self.ions_of_file, MeasuredIons):
             self.measured = self.ions_of_file.hits
             self._kept_maps, self._kept_picture = {}, (None, None)
+
+    def keep_ions(self, other: "Explorer") -> None:
+        """Keep the selection of ions of another explorer, if it has the same measurement."""
+        if isinstance(other.ions_of_file, MeasuredIons) and other.names[1] == self.names[1]:
+            self.ions_of_file = other.ions_of_file
+            self.selection_changed()
+            if self.is_comparison and not self.registered:
+                self.registration = self._same_size()
 
     @property
     def names(self) -> tuple[str, str]:

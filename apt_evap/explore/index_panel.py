@@ -28,7 +28,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.mouse_tools import MouseTool
 from apt_evap.explore.newest_task import NewestTaskRunner
-from apt_evap.explore.pole_panel import draw_poles, with_gaps
+from apt_evap.explore.pole_panel import draw_poles, sparse_labels, with_gaps
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.fit.fit_energies import measured_map
@@ -363,9 +363,9 @@ class IndexPanel:
         self.candidates, self._indexing, self._awaited = candidates, indexing, None
         self._hint, self._kept["candidates"] = text, (candidates, text, indexing)
         options = []
-        for number, (orientation, projection, quality) in enumerate(candidates):
+        for number, (orientation, _, quality) in enumerate(candidates):
             axis = " ".join(f"{component:.2f}" for component in orientation.axis)
-            options.append((str(number), f"{number + 1}: [{axis}], {projection.scale:.1f} mm/rad, {quality}"))
+            options.append((str(number), f"{number + 1}: [{axis}], {quality}"))
         self.choice.update(options=options, visible=bool(options))
         self.refine.visible = bool(options)
         if self.choice.value != "0" and options:
@@ -380,9 +380,10 @@ class IndexPanel:
             self.text.text = self._hint
             return
         orientation, projection, quality = self.candidates[int(self.choice.value or 0)]
-        drawn = overlay(orientation, projection, measured_map(self._measured()))
+        counts = measured_map(self._measured())
+        drawn = overlay(orientation, projection, counts)
         self.lines.data = _twice(with_gaps(drawn.lines))
-        self.poles.data = _twice(drawn.places) | {"label": list(drawn.labels)}
+        self.poles.data = _twice(drawn.places) | {"label": sparse_labels(drawn, counts)}
         self._put_handles(projection)
         axis = ", ".join(f"{component:.3f}" for component in orientation.axis)
         self.text.text = (

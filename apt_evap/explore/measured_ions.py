@@ -8,6 +8,9 @@ from typing import Any
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_spectrum import Spectrum, spectrum
 
+NUMBERED = "\0"
+"""Place in the text that reads a file where the rows are those of the file."""
+
 
 @dataclass(frozen=True)
 class IonSelection:
@@ -64,6 +67,12 @@ class MeasuredIons:
             self.select(selection)
 
     @property
+    def number(self) -> int:
+        """Number of the ions of the file, as far as it is known."""
+        ion = self.all.ion
+        return len(self.all) if ion is None or not len(ion) else int(ion.max()) + 1
+
+    @property
     def lacks_distance(self) -> bool:
         """Whether masses only need a flight length."""
         return self.all.mass_to_charge is None and self.distance is None and not self.lacks_times
@@ -116,9 +125,12 @@ class MeasuredIons:
         return arguments
 
     def code(self, code: str) -> str:
-        """Python expression of the same ions, from the one that reads the file."""
-        if self.selection.ions is not None:
-            code += f".window(ion={self.selection.ions!r})"
+        """Python expression of the same ions, from the one that reads the file.
+
+        The ions of the sequence are selected at `NUMBERED`, before other selections change their numbers.
+        """
+        window = "" if self.selection.ions is None else f".window(ion={self.selection.ions!r})"
+        code = code.replace(NUMBERED, window) if NUMBERED in code else code + window
         if self.selection.element is not None:
             words = [
                 code,

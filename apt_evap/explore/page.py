@@ -177,12 +177,12 @@ class Page:
         self.poles.hide_on_last(indexed)
 
     def _material(self):
-        """Name of the crystal of the run, if it is one of the table."""
+        """Name of the crystal of the run or of the command, if it is one of the table."""
         if self.explorer.run is not None:
             material = self.explorer.run.settings["tip"].get("material", {})
             if material.get("name") in MATERIALS:
                 return material["name"]
-        return ""
+        return self.explorer.crystal
 
     # ---- layout ----------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,11 @@ from typing import Any
 import numpy as np
 from bokeh.models import ColumnDataSource, LabelSet, Toggle
 
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
+from apt_evap.explore.marks import Overlay
+
+_LABEL = (0.08, 0.04)  # width and height of a label, over the width of the map
 
 
 class PolePanel:
@@ -48,9 +52,9 @@ class PolePanel:
         if drawn is None or (self._explorer.is_comparison and not self._explorer.registered):
             self.lines.data, self.poles.data = {"x": [], "y": []}, {"x": [], "y": [], "label": []}
             return
-        points = with_gaps(drawn.lines)
+        points, labels = with_gaps(drawn.lines), sparse_labels(drawn, self._maps.pictures[-1])
         self.lines.data = {"x": points[:, 0], "y": points[:, 1]}
-        self.poles.data = {"x": drawn.places[:, 0], "y": drawn.places[:, 1], "label": list(drawn.labels)}
+        self.poles.data = {"x": drawn.places[:, 0], "y": drawn.places[:, 1], "label": labels}
 
 
 def draw_poles(fig: Any, lines: ColumnDataSource, poles: ColumnDataSource) -> list[Any]:
@@ -65,6 +69,20 @@ def draw_poles(fig: Any, lines: ColumnDataSource, poles: ColumnDataSource) -> li
         fig.scatter("x", "y", source=poles, size=7, fill_alpha=0, line_color="white"),
         labels,
     ]
+
+
+def sparse_labels(drawn: Overlay, like: DetectorMap) -> list[str]:
+    """Labels of poles, those first that have the largest spacing; "" where another label is near."""
+    left, right, _, _ = like.extent
+    across, along = _LABEL[0] * (right - left), _LABEL[1] * (right - left)
+    labels: list[str] = []
+    places: list[Any] = []
+    for place, label in zip(drawn.places, drawn.labels, strict=True):
+        crowded = any(abs(place[0] - x) < across and abs(place[1] - y) < along for x, y in places)
+        labels.append("" if crowded else label)
+        if not crowded:
+            places.append(place)
+    return labels
 
 
 def with_gaps(lines: Sequence[Any]) -> Any:

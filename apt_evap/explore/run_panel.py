@@ -30,6 +30,8 @@ class ServerState:
     def __init__(self) -> None:
         self.run: BackgroundRun | None = None
         """The run in the background."""
+        self.doubt = ""
+        """What is not sure about the settings of the run, for the page."""
         self.registration_options: dict[str, dict[str, Any]] = {}
         """Options of `register` for the files of runs."""
         self.indexed: dict[str, dict[str, Any]] = {}
@@ -175,6 +177,7 @@ class RunPanel:
         self.simulate.disabled = False
         self.file.value = str(path)
         self._written(f"wrote {path}: {made.cost}", made, path)
+        self._state.doubt = "" if made.indexing.decided else "not decided: this is the first candidate; "
         self._start_or_stop()
 
     def _start_or_stop(self):
@@ -205,7 +208,7 @@ class RunPanel:
             state = run.message or f"{run.ions:,} of {run.n_ions:,} ions{left}"
             self.text.text = (
                 f'<progress value="{run.ions}" max="{run.n_ions or 1}" style="width: 100%"></progress><br>'
-                f"{escape(state)}; {escape(str(run.output))}, opened here at its end"
+                f"{self._state.doubt}{escape(state)}; {escape(str(run.output))}, opened here at its end"
             )
             self._later(self._update, INTERVAL)
         elif not run.finished:

@@ -104,8 +104,10 @@ def serve(
         assert with_file is not None
         if path == EXAMPLE:
             write_example()
-        shown = with_file(path)
+        before, shown = shown[0], with_file(path)
         remember_file(path)
+        if before is not None and shown[0] is not None and shown[0].names[1] != path:
+            shown[0].keep_ions(before)
         if shown[0] is not None:
             shown[0].registration_options = state.registration_options.get(path, {})
 

@@ -66,7 +66,7 @@ class SpectrumPanel:
         self._confirmed = False
         self.named: Spectrum | None = None
         """The spectrum that is shown."""
-        number = len(ions.all)
+        number = ions.number
         window = tuple(
             end if bound is None else int(bound)
             for bound, end in zip(ions.selection.ions or (None, None), (0, number), strict=True)
@@ -216,7 +216,7 @@ class SpectrumPanel:
         elif self.choice.value != _ALL:
             element = self.choice.value.removeprefix("ions of ")
         first, last = (int(end) for end in self.slider.value)
-        ions = None if (first, last) == (0, len(self._ions.all)) else (first, max(last, first + 1))
+        ions = None if (first, last) == (0, self._ions.number) else (first, max(last, first + 1))
         selection = IonSelection(element, mass, ions)
         if selection == self._ions.selection:
             return

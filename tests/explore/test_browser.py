@@ -8,11 +8,13 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 from rough import ROUGH
 
@@ -42,17 +44,12 @@ WATCH = """() => {
 }"""
 
 
-@pytest.fixture(scope="module")
-def served(small_tip, made_once, tmp_path_factory):
+@contextmanager
+def explorer_in(folder, *words):
     """Address of `apt-evap explore`, started as a user does."""
-    folder = tmp_path_factory.mktemp("served")
-    run = made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
-    run.save(folder / "run.h5")
-    hits = replace(run, seed=2).hits(ae.RollUp(0.2))
-    ae.write(folder / "ions.epos", ae.Hits(x=hits.x, y=hits.y).within_circle(60.0))
     code = "import sys; from apt_evap.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "explore", "run.h5", "ions.epos", "--registration=0,1,0,0", "--no-browser"]
-    environment = os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
+    command = [sys.executable, "-c", code, "explore", *words, "--no-browser"]
+    environment = os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1]), "XDG_STATE_HOME": str(folder)}
     with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True, env=environment) as process:
         try:
             yield process.stdout.readline().strip()
@@ -61,9 +58,21 @@ def served(small_tip, made_once, tmp_path_factory):
     assert process.returncode == 0
 
 
-@pytest.fixture
-def page(served):
-    """The page, its requests and the errors of its console."""
+@pytest.fixture(scope="module")
+def served(small_tip, made_once, tmp_path_factory):
+    """Address of a run beside ions."""
+    folder = tmp_path_factory.mktemp("served")
+    run = made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    run.save(folder / "run.h5")
+    hits = replace(run, seed=2).hits(ae.RollUp(0.2))
+    ae.write(folder / "ions.epos", ae.Hits(x=hits.x, y=hits.y).within_circle(60.0))
+    with explorer_in(folder, "run.h5", "ions.epos", "--registration=0,1,0,0") as url:
+        yield url
+
+
+@contextmanager
+def opened(url):
+    """A page of a browser, with its requests and the errors of its console."""
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
         context = browser.new_context(viewport={"width": 1400, "height": 1250})
@@ -75,12 +84,19 @@ def page(served):
         page.on("websocket", lambda socket: page.requests.append(socket.url))
         page.on("console", lambda message: message.type == "error" and page.errors.append(message.text))
         page.on("pageerror", lambda error: page.errors.append(str(error)))
-        page.goto(served)
-        page.wait_for_selector("canvas")
+        page.goto(url)
         page.wait_for_function("window.Bokeh && Bokeh.documents.length && Bokeh.documents[0].is_idle")
-        page.evaluate(WATCH)
         yield page
         browser.close()
+
+
+@pytest.fixture
+def page(served):
+    """The page of a run beside ions."""
+    with opened(served) as page:
+        page.wait_for_selector("canvas")
+        page.evaluate(WATCH)
+        yield page
 
 
 def picture(page, name):
@@ -207,3 +223,31 @@ def test_only_the_address_opens_the_page(served):
         with pytest.raises(HTTPError) as refused:
             urlopen(url)
         assert refused.value.code == 403
+
+
+def test_from_the_start_page(tmp_path):
+    """A dropped file is copied into the folder and opened; the example is a click away."""
+    content = tmp_path / "elsewhere"
+    content.mkdir()
+    rng = np.random.default_rng(1)
+    ae.write(content / "dropped.epos", ae.Hits(x=rng.normal(size=500), y=rng.normal(size=500)))
+    drop = """bytes => {
+      const transfer = new DataTransfer()
+      transfer.items.add(new File([new Uint8Array(bytes)], "dropped.epos"))
+      document.dispatchEvent(new DragEvent("drop", {dataTransfer: transfer, cancelable: true}))
+    }"""
+    shown = "[...Bokeh.documents[0].all_models].some(m => m.type == 'Div' && m.text.includes('%s'))"
+    (tmp_path / "work").mkdir()
+    with explorer_in(tmp_path / "work") as url, opened(url) as page:
+        page.get_by_text("Drop a measured file").wait_for()
+        picture(page, "start")
+        page.evaluate(drop, list((content / "dropped.epos").read_bytes()))
+        page.wait_for_function(shown % "<b>dropped.epos</b> 500 ions")
+        assert page.errors == []
+    assert (tmp_path / "work" / "dropped.epos").read_bytes() == (content / "dropped.epos").read_bytes()
+    with explorer_in(tmp_path / "work") as url, opened(url) as page:
+        page.get_by_text("nickel [111]").click()
+        page.wait_for_function(shown % "<b>example_ni111.npz</b>")
+        page.wait_for_selector("canvas")
+        picture(page, "example")
+        assert page.errors == []

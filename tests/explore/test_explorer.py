@@ -16,6 +16,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
+from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
 from apt_evap.explore.placement import misplaced
 from apt_evap.explore.specimen_surface import surface_atoms
 from apt_evap.fit.structure import PoleMeasure
@@ -486,6 +487,24 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
         with_file(options, "none.epos")
     explorer, settings = with_file(options, "run.h5")  # the file that failed is forgotten
     assert explorer.names == ("run.h5", "ions.epos") and len(explorer.show(settings).pictures) == 2
+
+
+def test_a_run_keeps_the_selected_ions(run, measured):
+    """Ions that were selected on the page are those beside a run that is opened later."""
+    words = {"run_arguments": ["run.h5"], "measured_arguments": ["ions.epos"]}
+    before = Explorer(None, MeasuredIons(measured), **words)
+    before.ions_of_file.select(IonSelection(ions=(0, 500)))
+    before.selection_changed()
+    explorer = Explorer(run, measured, **words)
+    size = explorer.registration.scale
+    explorer.keep_ions(before)
+    assert explorer.measured is before.measured and len(explorer.measured) == 500
+    shown = explorer.show(explorer.start)
+    assert shown.whole.ions <= 500 and "--ions=0,500" in explorer.commands(shown.settings).shell
+    assert explorer.registration.scale == pytest.approx(size, rel=0.1) and not explorer.registered
+    other = Explorer(run, measured, run_arguments=["run.h5"], measured_arguments=["other.epos"])
+    other.keep_ions(before)
+    assert other.measured is not before.measured
 
 
 def test_what_is_refused(run, measured):

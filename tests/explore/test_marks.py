@@ -125,3 +125,18 @@ def test_the_overlay_is_on_the_map():
 
 def test_negative_indices_have_bars():
     assert plain(r"$\bar{1}1\bar{3}$") == "1\u030513\u0305" and plain(r"$\bar{10}\,11$") == "1\u03050\u0305 11"
+
+
+def test_labels_do_not_cover_each_other():
+    pytest.importorskip("bokeh")
+    from apt_evap.explore.pole_panel import sparse_labels
+
+    orientation = ae.Orientation("Ni", axis=(0.3, 0.5, 0.8))
+    pattern = ae.maps.master_patterns("fcc")[0]
+    like = pattern.map(orientation, ae.detection.Projection(30.0), width=60.0, ions=20_000)
+    drawn = overlay(orientation, ae.detection.Projection(30.0), like)
+    labels = sparse_labels(drawn, like)
+    kept = drawn.places[[label != "" for label in labels]]
+    assert 5 < len(kept) < len(drawn.labels) and labels[0] == drawn.labels[0]
+    gaps = [np.abs(kept[i] - kept[j]) for i in range(len(kept)) for j in range(i)]
+    assert all(x >= 0.08 * 60.0 - 1e-9 or y >= 0.04 * 60.0 - 1e-9 for x, y in gaps)

@@ -1,6 +1,7 @@
 """Measured ions of the explorer: default masses, a range that is dragged, a part of the sequence, all as text, too."""
 
 import shlex
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -77,6 +78,44 @@ def test_a_selection_is_the_same_as_text(hits, selection, of_times, tmp_path, mo
     )
     assert main([*shlex.split(command.shell)[1:], "--quiet"]) == 0
     assert np.array_equal(drawn[0].density, explorer.show(view).whole.density, equal_nan=True)
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_numbers_of_ions_are_those_of_the_file(hits, monkeypatch):
+    """Also beside a circle, in the command and in the Python lines."""
+    monkeypatch.setattr("apt_evap.cli._files.read_file", lambda path, **options: hits)
+    monkeypatch.setattr(ae, "read", lambda path, **options: hits)
+    words = ["explore", "a.epos", "--circle=8", "--ions=1000,3000"]
+    explorer, view = explorer_and_view(make_parser().parse_args(words))
+    expected = hits.window(ion=(1000, 3000)).within_circle(8.0)
+    assert np.array_equal(explorer.measured.x, expected.x) and explorer.ions_of_file.number > 29_000
+    command = explorer.commands(view)
+    again, _ = explorer_and_view(make_parser().parse_args(["explore", *shlex.split(command.shell)[2:-4]]))
+    assert np.array_equal(again.measured.x, expected.x)
+    (code,) = [line for line in command.python.splitlines() if line.startswith("measured")]
+    names = {"Explorer": lambda run, measured: SimpleNamespace(bins_like=lambda bins: measured), "ae": ae}
+    exec(code, names)
+    assert np.array_equal(names["measured"].x, expected.x)
+
+
+def test_the_command_names_the_crystal(tmp_path, monkeypatch):
+    pytest.importorskip("bokeh")
+    from bokeh.document import Document
+
+    from apt_evap.explore.page import Page
+
+    monkeypatch.chdir(tmp_path)
+    edges = np.linspace(-20.0, 20.0, 41)
+    counts = np.random.default_rng(1).poisson(20.0, (40, 40))
+    np.savez("map.npz", counts=counts, x_edges_mm=edges, y_edges_mm=edges)
+    explorer, view = explorer_and_view(make_parser().parse_args(["explore", "map.npz", "--element", "Ni"]))
+    page = Page(explorer, Document(), view, later=lambda function, delay: None)
+    assert page.index.material.value == "Ni" and "111" in page.index.family.options
+    page.close()
+    explorer, _ = explorer_and_view(make_parser().parse_args(["explore", "map.npz"]))
+    assert explorer.crystal == ""
+    with pytest.raises(ValueError, match="--element"):
+        explorer_and_view(make_parser().parse_args(["explore", "map.npz", "--element", "Xy"]))
 
 
 def test_what_cannot_be_selected(hits):
