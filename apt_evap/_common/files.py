@@ -16,7 +16,7 @@ from apt_evap._common.types import AnyPath
 
 _UNFINISHED = re.compile(r"\..{0,40}\.[0-9a-f]{16}\.part", re.DOTALL)  # names of temporary files
 _ABANDONED_AFTER = 3600.0  # seconds since the last byte was written
-_RENAMES, _PAUSE = 40, 0.05  # seconds between two tries to rename a file on Windows
+_TRIES, _PAUSE = 500, 0.01  # to open or rename a file on Windows, and seconds between them
 _WAIT_FOR_NOBODY = getattr(os, "O_NONBLOCK", 0)
 
 
@@ -156,7 +156,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())  # the bytes must be on the disk before the name, in case of a power cut
         if mode is not None:
             part.chmod(mode)
-        _rename(part, target)
+        _when_free(os.replace, part, target)
         part = None
         flush_folder(target.parent)
     except OSError as error:
@@ -167,19 +167,19 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
                 part.unlink()
 
 
-def _rename(part, target):
-    """Rename a file; Windows refuses that while somebody reads the target, which is waited for."""
-    for _ in range(_RENAMES if sys.platform == "win32" else 0):
+def _when_free(function, path, *arguments):
+    """Open or rename a file; Windows refuses that while another process reads or renames it, which is waited for."""
+    for _ in range(_TRIES if sys.platform == "win32" and not os.path.isdir(path) else 0):
         with suppress(PermissionError):
-            return os.replace(part, target)
+            return function(path, *arguments)
         time.sleep(_PAUSE)
-    return os.replace(part, target)
+    return function(path, *arguments)
 
 
 def open_regular(path: AnyPath, flags: int) -> int:
     """Open a regular file as `os.open` does; OSError for folders, pipes and devices."""
     try:
-        descriptor = os.open(path, flags | _WAIT_FOR_NOBODY, 0o666)
+        descriptor = _when_free(os.open, path, flags | _WAIT_FOR_NOBODY, 0o666)
     except PermissionError:
         check_regular(os.stat(path))  # Windows opens no folders, and says no more
         raise

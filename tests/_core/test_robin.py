@@ -1,9 +1,12 @@
+import hashlib
+
 import numpy as np
 import pytest
 import twins
 from smooth import fibonacci, spheroid
 
 import apt_evap as ae
+from apt_evap._core.elementary import sine_and_cosine
 from apt_evap._core.interactions import InteractionLists
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
@@ -198,3 +201,15 @@ def test_threads_give_the_same_bits(small_tip):
     one, two = (ae.evaporation.Emitter(small_tip, n_threads=threads) for threads in (1, 2))
     assert np.array_equal(one.charges, two.charges)
     assert np.array_equal(one.normals, two.normals)
+
+
+def test_many_charges_have_the_same_bits_with_every_version_of_numpy():
+    """With NumPy 2.0, sums of more than 8192 numbers have another order than with NumPy 2.4."""
+    n = 40_000
+    z = 1.0 - (2.0 * np.arange(n) + 1.0) / n
+    sine, cosine = sine_and_cosine(2.4 * np.arange(n))
+    normals = np.stack([np.sqrt(1.0 - z * z) * cosine, np.sqrt(1.0 - z * z) * sine, z], axis=1)
+    tree = Octree(10.0 * (1.0 + 0.02 * cosine[:, None]) * normals, 1.0 + 0.5 * sine)
+    lists = InteractionLists(tree, 0.7, 1)
+    Robin(1e-5, 8).iterate(tree, np.ascontiguousarray(normals[tree.atoms]), lists, tolerance=1e-3)
+    assert hashlib.sha256(tree.charges.tobytes()).hexdigest()[:16] == "a68ec84bb88d755e"
