@@ -169,7 +169,7 @@ def test_the_search_is_the_direct_correlation():
     disc = disc_of(map)
     pattern = master_patterns("fcc")[0]
     start = search(disc, (pattern,), (58.0, 58.0), 1)[0]
-    radii, azimuths = module._polar(module.RINGS, module.AZIMUTHS)
+    radii, azimuths = module.polar_grid(module.RINGS, module.AZIMUTHS)
     slow, weights = module._slow(radii, azimuths)
     ring, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
     theta = ring * disc.radius / 58.0

@@ -19,6 +19,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
+from apt_evap.maps.indexing.contrast_search import search_contrast
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.marked_poles import check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
@@ -51,7 +52,8 @@ LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 SHOWN = 3
 """Largest number of candidates of an undecided map in texts and pictures."""
-_STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
+_STARTS, _SEEN = 12, 8  # orientations of both searches that are refined
+_FINAL = 6  # that are refined to the end
 _QUICK, _RIVALS = 7, 4  # steps of a first refinement; orientations of each other structure that are tried
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
@@ -325,6 +327,8 @@ def index(
         starts = search(disc, patterns, (low, high), _STARTS, marks)
         if marks:  # which may be wrong
             starts += search(disc, patterns, (low, high), _RIVALS)
+        else:
+            starts += search_contrast(disc, material, patterns, (low, high), _SEEN)
     else:
         matrix = _matrix_at(disc.centre, *start)
         starts = [Start(matrix, start[1].scale, 0.0, 0.5, number) for number in range(len(patterns))]
@@ -460,7 +464,8 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
         margin = float(evidence[0] - evidence[1])
     next_best = max(scores[1:], default=0.0)
     decided = margin > DECIDED and (marked or next_best < RIVAL * best)
-    numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
+    floor = f"{np.floor(margin):.0f}"  # 11.6 is not 12
+    numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {floor}; {DECIDED:g} is needed)"
     if not structured:
         decided, reason = False, "the map has no structure beyond its noise"
     elif contradiction:
@@ -470,7 +475,7 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
     elif decided and not marked and best < LEAST_SCORE:
         decided, reason = False, f"no orientation explains {LEAST_SCORE:.2f} of the structure: the first {numbers}"
     elif decided and best <= next_best:
-        reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
+        reason = f"only it fits the marks and the map (margin {floor}; {DECIDED:g} is needed)"
     elif decided:
         reason = f"it explains more than any other orientation or scale, {numbers}"
     elif margin > DECIDED:
