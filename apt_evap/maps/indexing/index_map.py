@@ -19,6 +19,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
+from apt_evap.maps.indexing.contrast_search import search_contrast
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.marked_poles import check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
@@ -37,6 +38,8 @@ DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
 """Largest score of another orientation, relative to that of the first one, with which a map decides."""
+SCALE_RIVAL = 0.9
+"""The same for another scale of the first orientation, which shares the pole at its centre."""
 LEAST_SCORE = 1 / 3
 """Smallest score with which a map decides, without marks: a measured nickel map reaches 0.28 for a wrong orientation
 with a margin of 26, a measured tungsten map 0.40 for the right one. Chosen with these two maps."""
@@ -51,7 +54,8 @@ LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 SHOWN = 3
 """Largest number of candidates of an undecided map in texts and pictures."""
-_STARTS, _FINAL = 12, 6  # orientations that are refined, and that are refined to the end
+_STARTS, _SEEN = 12, 8  # orientations of both searches that are refined
+_FINAL = 6  # that are refined to the end
 _QUICK, _RIVALS = 7, 4  # steps of a first refinement; orientations of each other structure that are tried
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
@@ -271,16 +275,19 @@ def index(
     Notes
     -----
     A search over all axes, rotations and scales compares the map with a master pattern: the density of hits in every
-    direction of the crystal, simulated, for ions that roll up and for ions that do not. The best results are refined by
-    the likelihood of the counts, with free amplitudes of both patterns and a slow change of the efficiency. The margin
-    of two orientations is twice the logarithm of the ratio of their likelihoods, divided by the variance of the sums of
-    neighbouring residuals of the better one in units of Poisson's. So a model that leaves structure unexplained decides
-    less. The map is `decided` if the margin to the next result is above 12: another orientation, by more than 6
-    degrees, or the same one at a scale that differs so much that the half angle of the field of view does. Without
-    marks of a user it also needs 4,000 ions and a score of a third, no such result may explain more than 0.8 of what
-    the first one explains, and no other crystal structure more. A map of noise has a score of 0. Marks that no
-    orientation explains, or that contradict the map, are named in the reason, and the map is not decided.
-    `Indexing.deciding_marks` says which mark would decide.
+    direction of the crystal, simulated, for ions that roll up and for ions that do not. A second search compares local
+    contrast with the patterns, with zone lines that may be bright or dark, and with dark poles: it proposes what a
+    person sees. The best results of both are refined by the likelihood of the counts, with free amplitudes of both
+    patterns and a slow change of the efficiency. The margin of two results is twice the logarithm of the ratio of their
+    likelihoods, divided by the variance of the sums of neighbouring residuals of the better one in units of Poisson's.
+    So a model that leaves structure unexplained decides less.
+
+    The map is `decided` if the margin to the next result is above 12: another orientation, by more than 6 degrees, or
+    the same one at a scale that changes the half angle of the field of view by more than 6 degrees. Without marks of a
+    user it also needs 4,000 ions and a score of a third, no other orientation may explain more than 0.8 of what the
+    first one explains, no other scale of the same one more than 0.9, and no other crystal structure more. A map of
+    noise has a score of 0. Marks that no orientation explains, or that contradict the map, are named in the reason, and
+    the map is not decided. `Indexing.deciding_marks` says which mark would decide.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -325,6 +332,8 @@ def index(
         starts = search(disc, patterns, (low, high), _STARTS, marks)
         if marks:  # which may be wrong
             starts += search(disc, patterns, (low, high), _RIVALS)
+        else:
+            starts += search_contrast(disc, material, patterns, (low, high), _SEEN)
     else:
         matrix = _matrix_at(disc.centre, *start)
         starts = [Start(matrix, start[1].scale, 0.0, 0.5, number) for number in range(len(patterns))]
@@ -459,8 +468,13 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
     if len(fits) > 1:
         margin = float(evidence[0] - evidence[1])
     next_best = max(scores[1:], default=0.0)
-    decided = margin > DECIDED and (marked or next_best < RIVAL * best)
-    numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {margin:.0f}; {DECIDED:g} is needed)"
+    alike = any(
+        score >= (RIVAL if misorientation(fit.matrix, fits[0][1].matrix, proper) > DIFFERENT else SCALE_RIVAL) * best
+        for (_, fit), score in zip(fits[1:], scores[1:], strict=True)
+    )
+    decided = margin > DECIDED and (marked or not alike)
+    floor = f"{np.floor(margin):.0f}"  # 11.6 is not 12
+    numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {floor}; {DECIDED:g} is needed)"
     if not structured:
         decided, reason = False, "the map has no structure beyond its noise"
     elif contradiction:
@@ -470,14 +484,14 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
     elif decided and not marked and best < LEAST_SCORE:
         decided, reason = False, f"no orientation explains {LEAST_SCORE:.2f} of the structure: the first {numbers}"
     elif decided and best <= next_best:
-        reason = f"only it fits the marks and the map (margin {margin:.0f}; {DECIDED:g} is needed)"
+        reason = f"only it fits the marks and the map (margin {floor}; {DECIDED:g} is needed)"
     elif decided:
         reason = f"it explains more than any other orientation or scale, {numbers}"
     elif margin > DECIDED:
         reason = f"another orientation or scale explains nearly as much: the first {numbers}"
     else:
-        alike = int(np.count_nonzero(evidence > evidence[0] - DECIDED))
-        reason = f"{alike} orientations or scales explain the map about equally well, {numbers}"
+        several = int(np.count_nonzero(evidence > evidence[0] - DECIDED))
+        reason = f"{several} orientations or scales explain the map about equally well, {numbers}"
     return Indexing(measured, tuple(candidates), decided, reason)
 
 

@@ -32,7 +32,7 @@ BRIGHTEST = 8.0
 _LEVELS = 255 / math.sqrt(BRIGHTEST)  # stored values are square roots: noise of a count is equal at all densities
 
 
-def _disc(directions: Floats) -> Floats:
+def pixels_of(directions: Floats) -> Floats:
     """Pixels, shape (2, n), of directions on the equal-area disc of a hemisphere; opposite directions are equal."""
     x, y, z = np.where(directions[:, 2:] < 0, -directions, directions).T
     stretch = np.sqrt(2 / (1 + z)) / PIXEL
@@ -173,13 +173,13 @@ class MasterPattern:
 
 def sampled(densities: Floats, directions: Floats) -> Floats:
     """Densities on the disc, shape (k, n, n), at unit vectors of shape (m, 3), by linear interpolation, (k, m)."""
-    pixels = _disc(directions)
+    pixels = pixels_of(directions)
     return np.stack([scipy.ndimage.map_coordinates(density, pixels, order=1, mode="nearest") for density in densities])
 
 
 def nearest(densities: Floats, directions: Floats) -> Floats:
     """Densities on the disc, shape (k, n, n), at the pixels next to unit vectors of shape (m, 3), (k, m)."""
-    row, column = np.rint(_disc(directions)).astype(np.intp)
+    row, column = np.rint(pixels_of(directions)).astype(np.intp)
     return densities[:, row, column]
 
 

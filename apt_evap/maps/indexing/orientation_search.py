@@ -97,7 +97,7 @@ def _distance(mask, bin_size):
     return scipy.ndimage.distance_transform_edt(np.pad(mask, 1), sampling=bin_size[::-1])[1:-1, 1:-1]
 
 
-def _polar(rings, azimuths):
+def polar_grid(rings, azimuths):
     """Radii, shape (rings,), as fractions of the rim, and azimuths [rad]."""
     return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
 
@@ -116,7 +116,7 @@ def flattened(disc: Disc, sigma: float) -> Floats:
 
     Shape (RINGS, AZIMUTHS).
     """
-    radii, azimuths = _polar(RINGS, AZIMUTHS)
+    radii, azimuths = polar_grid(RINGS, AZIMUTHS)
     slow, weights = _slow(radii, azimuths)
     smoothed = disc.map.smoothed(max(sigma, _NARROW * disc.radius))
     values = np.where(smoothed.mask, smoothed.values, np.nan)
@@ -180,7 +180,7 @@ def search(
     list of Start
         The best ones, each more than two steps from a better one.
     """
-    radii, azimuths = _polar(RINGS, AZIMUTHS)
+    radii, azimuths = polar_grid(RINGS, AZIMUTHS)
     slow, weights = _slow(radii, azimuths)
     root = np.sqrt(weights)
     group = point_group(patterns[0].structure)
@@ -203,7 +203,7 @@ def search(
             if marks:
                 for mirror in (False, True):
                     cost[int(mirror)] = MARK_COST * rotations_misfit(
-                        marks, marked, _matrix(turn, mirror, 0.0), azimuths
+                        marks, marked, oriented(turn, mirror, 0.0), azimuths
                     )
             for number, smoothed in enumerate(smooth):
                 densities = np.minimum(nearest(smoothed, local @ turn), _BRIGHTEST) * root
@@ -220,7 +220,7 @@ def search(
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []
     for score, rolled, number, scale, turn, mirror, angle in scored:
-        matrix = _matrix(turn, mirror, angle)
+        matrix = oriented(turn, mirror, angle)
         if not any(
             misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
             and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
@@ -232,7 +232,7 @@ def search(
     return starts
 
 
-def _matrix(turn, mirror, angle):
+def oriented(turn, mirror, angle):
     """Rotation from crystal to specimen of a result of the search."""
     cosine, sine = np.cos(angle), np.sin(angle)
     about = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])

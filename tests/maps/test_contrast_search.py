@@ -1,0 +1,125 @@
+"""Search by local contrast: its evidence, and orientations of maps with lines of either sign."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.maps.crystallography.directions import zones
+from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing import contrast_search as module
+from apt_evap.maps.indexing.contrast_search import (
+    AXIS_STEP,
+    PIECES,
+    SCALE_STEP,
+    Terms,
+    evidence,
+    local_contrast,
+    search_contrast,
+)
+from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.maps.indexing.orientation_search import disc_of, misorientation
+from apt_evap.maps.indexing.refine import directions_of
+
+SCALE, WIDTH = 60.0, 70.0
+GROUP = point_group("fcc")
+PROPER = GROUP[np.linalg.det(GROUP) > 0]
+
+
+def map_of_lines(orientation, amplitude, ions=60_000):
+    """Counts with bright or dark lines along the zones of a crystal, and a slow change by a factor of 3."""
+    edges = np.linspace(-WIDTH / 2, WIDTH / 2, 97)
+    middle = (edges[:-1] + edges[1:]) / 2
+    x, y = (values.ravel() for values in np.meshgrid(middle, middle))
+    directions = ae.detection.Projection(SCALE).directions(np.column_stack([x, y])) @ orientation.matrix
+    axes = zones(orientation.material)
+    sines = np.abs(directions @ axes.directions[axes.families == 0].T).min(axis=1)
+    density = (1 + amplitude * np.exp(-0.5 * (sines / 0.03) ** 2)) * np.exp(np.log(3) * x / WIDTH)
+    mask = np.hypot(x, y) < WIDTH / 2
+    mean = np.where(mask, density, 0) * (ions / density[mask].sum())
+    counts = np.random.default_rng(2).poisson(mean).reshape(96, 96)
+    return ae.DetectorMap.from_array(counts, edges, edges, mask.reshape(96, 96), is_counts=True)
+
+
+def test_the_evidence_is_the_marginal_likelihood():
+    """That of y ~ N(0, v (1 + T S^2 T')), integrated over the variance v with the prior 1 / v, by its formula."""
+    random = np.random.default_rng(3)
+    terms = random.normal(size=(PIECES, 3)) @ np.array([[1.0, 0.4, 0.0], [0.0, 1.0, 0.3], [0.0, 0.0, 0.5]])
+    priors = np.array([0.6, 1.0, 0.3])
+    pictures = terms @ np.array([[0.3, 0.0], [-0.2, 0.05], [0.1, 0.0]]) + random.normal(size=(PIECES, 2))
+    pictures /= np.sqrt((pictures**2).mean(axis=0))
+    covariance = np.eye(PIECES) + (terms * priors**2) @ terms.T
+    squares = (pictures * np.linalg.solve(covariance, pictures)).sum(axis=0)
+    direct = -PIECES * np.log(squares / PIECES) - np.linalg.slogdet(covariance)[1]
+    gram, cross = terms.T @ terms / PIECES, terms.T @ pictures / PIECES
+    assert evidence(gram, cross, priors, np.ones(3, bool)) == pytest.approx(direct, abs=1e-6)
+    # an amplitude that may not be negative explains nothing where it is
+    single = evidence(gram[:1, :1], np.array([[0.4, -0.4]]), priors[:1], np.zeros(1, bool))
+    volume = np.log(1 + PIECES * priors[0] ** 2 * gram[0, 0])
+    assert single[1] == pytest.approx(-volume) and single[0] > single[1] + 50
+
+
+def test_local_contrast_has_no_unit_and_no_slow_change():
+    random = np.random.default_rng(4)
+    image = 1 + 0.1 * random.random((80, 80))
+    mask = np.hypot(*(np.indices((80, 80)) - 39.5)) < 38
+    first = local_contrast(image, mask, 1.0, 4.0)
+    assert local_contrast(1e6 * image, mask, 1.0, 4.0) == pytest.approx(first, abs=1e-9)
+    slow = np.exp(np.indices((80, 80))[0] / 60)  # by 7 % over the wide Gaussian
+    inner = np.hypot(*(np.indices((80, 80)) - 39.5)) < 26
+    assert np.abs(local_contrast(slow, mask, 1.0, 4.0))[inner].max() < 0.005
+    spot = np.zeros((80, 80))
+    spot[40, 40] = 1.0
+    assert np.abs(local_contrast(spot, mask, 1.0, 4.0)).max() <= 1.0
+    assert np.abs(local_contrast(np.full((80, 80), 3.0), mask, 1.0, 4.0))[mask].max() < 1e-9
+
+
+def direct_evidence(disc, patterns, matrix, scale):
+    """Evidence of an orientation, without Fourier transforms."""
+    terms = Terms(ae.material("Ni"), patterns)
+    places, areas = module._places()
+    pictures = terms.at(directions_of(places, disc.radius, scale, 0.0) @ matrix, disc.radius / scale).astype(float)
+    pictures -= (pictures @ areas)[:, None]
+    pictures /= np.sqrt(pictures**2 @ areas)[:, None]
+    cross = (pictures * areas) @ module.picture_of(disc)
+    return evidence((pictures * areas) @ pictures.T, cross[:, None], terms.priors, terms.signed)[0]
+
+
+@pytest.mark.parametrize("amplitude", [0.6, -0.5])
+def test_bright_and_dark_lines_give_the_orientation(amplitude):
+    """The truth has more evidence than all results, and is among them within the steps of the search."""
+    orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    disc = disc_of(map_of_lines(orientation, amplitude))
+    patterns = master_patterns("fcc")
+    starts = search_contrast(disc, ae.material("Ni"), patterns, (45.0, 80.0), 8)
+    assert [start.pattern for start in starts] == [0, 1] * 8
+    scores = [start.score for start in starts[::2]]
+    assert scores == sorted(scores, reverse=True)
+    assert direct_evidence(disc, patterns, orientation.matrix, SCALE) > scores[0] + 20
+    near = [start for start in starts if misorientation(start.matrix, orientation.matrix, PROPER) < 1.5 * AXIS_STEP]
+    assert any(start.scale == pytest.approx(SCALE, rel=SCALE_STEP) for start in near)
+
+
+def test_the_search_is_the_direct_evidence():
+    orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    disc = disc_of(map_of_lines(orientation, 0.6))
+    patterns = master_patterns("fcc")
+    start = search_contrast(disc, ae.material("Ni"), patterns, (SCALE, SCALE), 1)[0]
+    # both take the nearest pixel, of equal directions that are not the same
+    direct = direct_evidence(disc, patterns, start.matrix, SCALE)
+    assert start.score == pytest.approx(direct, rel=0.1) and start.score > 50
+
+
+def test_the_star_of_a_measured_map_of_nickel_is_a_candidate():
+    """Six lines meet at (-9.6, -0.4) mm in a {111} pole; without this search no candidate has it."""
+    path = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
+    if not path.exists():
+        pytest.skip(f"the measured map {path} is missing")
+    found = ae.index(ae.read(path), "Ni")
+    distances = []
+    for candidate in found.candidates[:3]:
+        poles = candidate.projection.places(candidate.orientation.directions(GROUP @ np.ones(3)))
+        distances.append(np.nanmin(np.hypot(*(poles - (-9.6, -0.4)).T)))
+    assert min(distances) < 1.5
+    assert any("(-9, 0) mm is {111}" in mark or "(-10, 0) mm is {111}" in mark for mark in found.deciding_marks)
