@@ -24,8 +24,9 @@ int main(void)
     static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
     static int list[N];
     int range[2] = {0, N};
-    float targets[3 * GROUP], sums[3 * GROUP] = {0}, dot;
-    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0};
+    static float columns[CELL * N];
+    float targets[3 * GROUP], sums[3 * GROUP] = {0}, bundle[3 * GROUP] = {0}, dot;
+    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0}, totals[100];
     static double multipoles[MULTIPOLE * N];
     static float row_potential[N], zero[GROUP];
     double potentials[GROUP] = {0}, zeros[GROUP] = {0};
@@ -35,7 +36,7 @@ int main(void)
         fx[i] = x[i] = drand48() * 10, fy[i] = y[i] = drand48() * 10, fz[i] = z[i] = drand48() * 10;
         q[i] = drand48(), fq[i] = q[i] - 0.5, list[i] = i;
         for (int j = 0; j < CELL; j++)
-            cells[CELL * i + j] = drand48();
+            columns[CELL * i + j] = cells[CELL * i + j] = drand48();
     }
     for (int l = 0; l < 3 * GROUP; l++)
         wide[l] = targets[l] = drand48();
@@ -45,6 +46,9 @@ int main(void)
     group_cells_double(N, list, cells, origin, wide, wide_sums);
     point_atoms_double(N - 3, x, y, z, q, 5, 5, 12, e);
     point_cells_double(N, N, cells, 5, 5, 12, e);
+    bundle_atoms(N - 3, N, columns, GROUP, targets, bundle);
+    bundle_cells(N - 3, N, columns, GROUP, targets, bundle);
+    weighted_sum(99, N / 100, x, y, 100, totals);
     patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
@@ -59,6 +63,7 @@ int main(void)
     patch_potential_and_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential, px, py, pz);
     add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
+    add(bundle, sizeof bundle), add(totals, 99 * sizeof totals[0]);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);
     return 0;
@@ -77,17 +82,19 @@ def test_bits_do_not_depend_on_the_processor(tmp_path):
         .replace("target_clones(", "unused)) /* target_clones(")
         .replace('"default"), unused))', '"default"), unused) */')
     )
+    for part in CORE.glob("*.h"):
+        shutil.copy(part, tmp_path)
     (tmp_path / "kernels.h").write_text(header)
-    for part in ("kernels_group.h", "kernels_point.h"):
-        (tmp_path / part).write_text((CORE / part).read_text())
     (tmp_path / "sums.c").write_text(PROGRAM)
     seen = {}
     flags = ["-fopenmp", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off"]
     for processor in ("x86-64", "x86-64-v3", "x86-64-v4"):
         for level in ("-O1", "-O3"):
             build = [compiler, level, f"-march={processor}", *flags, "sums.c", "-o", "sums", "-lm"]
-            if subprocess.run(build, cwd=tmp_path, capture_output=True).returncode:
+            built = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
+            if built.returncode and "-march" in built.stderr:
                 pytest.skip(f"gcc cannot build for {processor}")
+            assert built.returncode == 0, built.stderr
             done = subprocess.run(["./sums"], cwd=tmp_path, capture_output=True, text=True)
             if done.returncode == 0:  # else this processor lacks the instructions
                 seen[processor, level] = done.stdout
