@@ -8,13 +8,20 @@ cdef enum:
     MONOMIALS = ORDER * (ORDER + 1) * (ORDER + 2) // 6   # of each component of the field, up to degree ORDER - 1
 
 
+cdef struct Expansion:
+    double[3] centre                          # of the ball
+    double radius
+    float[3 * MONOMIALS] coefficients
+
+
 cdef class FarField:
     cdef const double[:, ::1] matrix          # (3 SAMPLES, 3 MONOMIALS)
     cdef const double[:, ::1] directions      # (SAMPLES, 3)
-    cdef float[3 * MONOMIALS] coefficients
-    cdef double[3] centre
-    cdef double radius
+    cdef Expansion expansion                  # of the methods for Python
 
-    cdef void point(self, int sample, double* position) noexcept nogil
-    cdef void expand(self, const double* field) noexcept nogil
-    cdef void add(self, Index n, const double* positions, const Index* which, double* field) noexcept nogil
+    cdef void point(self, const Expansion* expansion, int sample, double* position) noexcept nogil
+    cdef void expand(self, Expansion* expansion, const double* field) noexcept nogil
+
+
+cdef void add_expanded(const Expansion* expansion, Index n, const double* positions, const Index* which,
+                       double* field) noexcept nogil

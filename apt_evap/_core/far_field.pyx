@@ -22,6 +22,7 @@ cdef extern from "kernels.h":
     const int SINGLE_LANES
     void polynomial_field(int, const float*, const float*, const float*, const float*,
                           float*, float*, float*) noexcept nogil
+    void weighted_sum(Index, int, const double*, const double*, Index, double*) noexcept nogil
 
 N_SAMPLES, POTENTIAL_ORDER = SAMPLES, ORDER
 
@@ -106,6 +107,29 @@ def _matrix():
     return np.ascontiguousarray(np.concatenate(by_component, axis=1))
 
 
+cdef void add_expanded(const Expansion* expansion, Index n, const double* positions, const Index* which,
+                       double* field) noexcept nogil:
+    # Adds the field at the points (., 3) with the indices `which`.
+    cdef float[16] x, y, z, ex, ey, ez
+    cdef double scale = 1.0 / expansion.radius
+    cdef const double* centre = expansion.centre
+    cdef Index first = 0, lane, m, i
+    while first < n:
+        m = min(<Index>SINGLE_LANES, n - first)
+        for lane in range(SINGLE_LANES):
+            i = 3 * which[first + min(lane, m - 1)]
+            x[lane] = <float>((positions[i] - centre[0]) * scale)
+            y[lane] = <float>((positions[i + 1] - centre[1]) * scale)
+            z[lane] = <float>((positions[i + 2] - centre[2]) * scale)
+        polynomial_field(ORDER - 1, expansion.coefficients, x, y, z, ex, ey, ez)
+        for lane in range(m):
+            i = 3 * which[first + lane]
+            field[i] += ex[lane]
+            field[i + 1] += ey[lane]
+            field[i + 2] += ez[lane]
+        first += SINGLE_LANES
+
+
 cdef class FarField:
     """Expansion of a field about a ball.
 
@@ -119,60 +143,33 @@ cdef class FarField:
 
     def __init__(self, centre, double radius):
         self.matrix, self.directions = _matrix(), _directions()
-        self.centre[0], self.centre[1], self.centre[2] = centre
-        self.radius = radius
+        self.expansion.centre[0], self.expansion.centre[1], self.expansion.centre[2] = centre
+        self.expansion.radius = radius
 
-    cdef void point(self, int sample, double* position) noexcept nogil:
+    cdef void point(self, const Expansion* expansion, int sample, double* position) noexcept nogil:
         # One of the points at which `expand` needs the field.
         cdef int axis
         for axis in range(3):
-            position[axis] = self.centre[axis] + self.radius * self.directions[sample, axis]
+            position[axis] = expansion.centre[axis] + expansion.radius * self.directions[sample, axis]
 
-    cdef void expand(self, const double* field) noexcept nogil:
+    cdef void expand(self, Expansion* expansion, const double* field) noexcept nogil:
         # From the field at the samples, (SAMPLES, 3).
         cdef double[3 * MONOMIALS] total
-        cdef const double* row
-        cdef double value
-        cdef int i, j
+        cdef int j
+        weighted_sum(3 * MONOMIALS, 3 * SAMPLES, field, &self.matrix[0, 0], 3 * MONOMIALS, total)
         for j in range(3 * MONOMIALS):
-            total[j] = 0.0
-        for i in range(3 * SAMPLES):
-            row, value = &self.matrix[i, 0], field[i]
-            for j in range(3 * MONOMIALS):
-                total[j] += row[j] * value
-        for j in range(3 * MONOMIALS):
-            self.coefficients[j] = <float>total[j]
-
-    cdef void add(self, Index n, const double* positions, const Index* which, double* field) noexcept nogil:
-        # Adds the field at the points (., 3) with the indices `which`.
-        cdef float[16] x, y, z, ex, ey, ez
-        cdef double scale = 1.0 / self.radius
-        cdef Index first = 0, lane, m, i
-        while first < n:
-            m = min(<Index>SINGLE_LANES, n - first)
-            for lane in range(SINGLE_LANES):
-                i = 3 * which[first + min(lane, m - 1)]
-                x[lane] = <float>((positions[i] - self.centre[0]) * scale)
-                y[lane] = <float>((positions[i + 1] - self.centre[1]) * scale)
-                z[lane] = <float>((positions[i + 2] - self.centre[2]) * scale)
-            polynomial_field(ORDER - 1, self.coefficients, x, y, z, ex, ey, ez)
-            for lane in range(m):
-                i = 3 * which[first + lane]
-                field[i] += ex[lane]
-                field[i + 1] += ey[lane]
-                field[i + 2] += ez[lane]
-            first += SINGLE_LANES
+            expansion.coefficients[j] = <float>total[j]
 
     @property
     def samples(self):
         """Points at which `fit` needs the field [nm], shape (SAMPLES, 3)."""
-        return np.array(self.centre) + self.radius * np.asarray(self.directions)
+        return np.array(self.expansion.centre) + self.expansion.radius * np.asarray(self.directions)
 
     def fit(self, const double[:, ::1] field):
         """Expand the field that has these values at the samples, shape (SAMPLES, 3)."""
         if field.shape[0] != SAMPLES or field.shape[1] != 3:
             raise ValueError(f"field must have shape ({SAMPLES}, 3), got {(field.shape[0], field.shape[1])}")
-        self.expand(&field[0, 0])
+        self.expand(&self.expansion, &field[0, 0])
 
     def fields(self, const double[:, ::1] positions):
         """Field at points in the ball [nm], shape (n, 3)."""
@@ -180,5 +177,5 @@ cdef class FarField:
         cdef double[:, ::1] field = np.zeros((n, 3))
         cdef Index[::1] which = np.arange(n, dtype=np.int64)
         if n:
-            self.add(n, &positions[0, 0], &which[0], &field[0, 0])
+            add_expanded(&self.expansion, n, &positions[0, 0], &which[0], &field[0, 0])
         return np.asarray(field)

@@ -3,7 +3,9 @@
 Flights are in reduced units: charge and mass of the ion are 1, so velocities are in sqrt(V) and times in nm/sqrt(V);
 the path of an ion depends only on its energy per charge. Flights that start together (one ion with many perturbations)
 have common steps, with one walk through the tree per step: the sources for a ball around all flights are collected
-once, then summed for every stage and flight.
+once. For a group of flights, the field of distant sources is expanded about a ball around each part of the step (see
+`far_field`), because the group is narrow and the step is long; near sources are summed for every stage, with the
+flights in the vector lanes.
 
 The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikkawy and Prince (IMA J. Numer. Anal. 7,
 423, 1987), nine stages per step.
@@ -12,17 +14,26 @@ The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikk
 from libc.math cimport INFINITY, NAN, sqrt
 from libc.stdlib cimport free, malloc
 
-from apt_evap._core.far_field cimport SAMPLES, FarField
+import numpy as np
+
+from apt_evap._core.far_field cimport SAMPLES, Expansion, FarField, add_expanded
 from apt_evap._core.index cimport Index
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport (
-    SingleSources, Sources, single_field, single_free, sources_field, sources_free, sources_init,
+    SingleSources, Sources, single_field, single_free, single_pad, sources_field, sources_free, sources_init,
 )
 
 cdef extern from "elementary.h":
     double inverse_seventh_root(double) noexcept nogil
     void sine_cosine(double, double*, double*) noexcept nogil
+
+
+cdef extern from "kernels.h":
+    const int SINGLE_LANES
+    void bundle_atoms(Index, Index, const float*, Index, const float*, float*) noexcept nogil
+    void bundle_cells(Index, Index, const float*, Index, const float*, float*) noexcept nogil
+    void weighted_sum(Index, int, const double*, const double*, Index, double*) noexcept nogil
 
 
 cdef extern from *:
@@ -38,6 +49,7 @@ cdef extern from *:
 
 cdef enum:
     STAGES = 9
+    PARTS = 3            # of a step, each with its own expansion
     FEWEST = 6           # flights of a bundle from which an expansion of the field costs less than sums for each flight
     ION_LEFT = 0
     ION_NEVER_LEFT = 1   # also the value during the flight
@@ -52,15 +64,20 @@ LEFT, NEVER_LEFT, NOT_FLOWN = ION_LEFT, ION_NEVER_LEFT, ION_NOT_FLOWN
 cdef double SCOUT_ANGLE = 0.8
 cdef double SCOUT_TOLERANCE = 3e-2
 
-# Distance in radii of the ball of a step from which sources are expanded, for few flights and for many. Measured on
-# Ni[111], R = 8 and 12 a: with 3.5, times of flight deviate by 1.1e-5 instead of 0.7e-5 (RMS), places by 1.6 instead of
-# 1.4 um. Many flights are those of wide responses, whose polynomials deviate more: 2.0e-5, 2 um and above.
-cdef double FAR = 4.5
-cdef double FAR_OF_MANY = 3.5
-cdef Index MANY = 32
+# The field of distant sources is expanded about one ball for each part of a step, or about one for the whole step if
+# the balls of the parts are not smaller than SPLIT of it. FAR is the distance in radii of a ball from which sources are
+# expanded. Measured on Ni[111], R = 80 a, wide responses, 450 launches against direct sums: with 2.5 / 2.75 / 3 / 3.5,
+# places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in 1.02 / 1.14 / 1.21
+# / 1.40 ms an ion.
+cdef double FAR = 3.0
+cdef double SPLIT = 0.8
 cdef Index MOST_REFUSED = 12  # successive steps that hit an atom, each a tenth of the one before: it starts at one
 
 cdef double[9] NODE = [0.0, 1 / 20.0, 1 / 10.0, 3 / 10.0, 1 / 2.0, 7 / 10.0, 9 / 10.0, 1.0, 1.0]
+# The parts of a step: which one a stage belongs to, and its first and last node.
+cdef int[9] PART = [0, 0, 0, 0, 1, 1, 2, 2, 2]
+cdef double[3] BEGIN = [0.0, 0.5, 0.9]
+cdef double[3] END = [0.3, 0.7, 1.0]
 cdef double[81] STAGE = [
     0, 0, 0, 0, 0, 0, 0, 0, 0,
     1 / 800.0, 0, 0, 0, 0, 0, 0, 0, 0,
@@ -117,17 +134,21 @@ cdef class Flights:
     cdef Sources sources
     cdef SingleSources near, far
     cdef FarField far_field
-    cdef bint expanded
+    cdef Expansion[PARTS] expansions
+    cdef int n_parts           # 0 if the sources are not expanded
+    cdef bint in_lanes         # whether the flights are in the vector lanes of the sums
     cdef double coulomb, length, reach, opening_angle, tolerance
     cdef double[3] centre
     cdef Index max_steps, fewest
     cdef Index capacity
-    cdef double* work          # (STAGES + 3, capacity, 3): accelerations, then position, velocity, trial position
+    cdef double* work          # (STAGES + 4, capacity, 3): accelerations, then position, velocity, trial position, sums
+    cdef float* lanes          # (6, capacity + SINGLE_LANES): places relative to the centre of the sources, and fields
     cdef Index* flying         # (capacity,) flights that have not ended
     cdef readonly Index n_steps, n_evaluations, n_pairs
 
     def __cinit__(self, *args, **kwargs):
         self.work = NULL
+        self.lanes = NULL
         self.flying = NULL
         self.capacity = 0
         sources_init(&self.sources)
@@ -148,6 +169,7 @@ cdef class Flights:
         single_free(&self.near)
         single_free(&self.far)
         free(self.work)
+        free(self.lanes)
         free(self.flying)
 
     def begin(self, Octree tree):
@@ -251,6 +273,17 @@ cdef class Flights:
                     self.fly_group(1, &positions[k, 0], &velocities[k, 0], &end[k, 0], &outcome[k])
         return 0
 
+    def accelerations(self, const double[:, ::1] positions):
+        """Accelerations [V/nm] at n places in the present field, as of the flights of one group; shape (n, 3)."""
+        cdef Index m = positions.shape[0]
+        cdef double[:, ::1] result = np.zeros((m, 3)), at_rest = np.zeros((m, 3))
+        cdef signed char[::1] outcome = np.full(m, ION_NEVER_LEFT, np.int8)
+        if m:
+            self.reserve(m)
+            self.gather(m, &positions[0, 0], &at_rest[0, 0], &at_rest[0, 0], &outcome[0], 0.0)
+            self.evaluate(m, &positions[0, 0], &result[0, 0], &outcome[0], 0)
+        return np.asarray(result)
+
     cdef bint stays_outside(self, const Index[::1] families, const double* end, const signed char* outcome,
                             double rim, double margin, double plane) noexcept nogil:
         # Whether no launch of the ion can arrive within the rim, from the ends of its scouts.
@@ -304,66 +337,48 @@ cdef class Flights:
         cdef double* x
         cdef double* v
         cdef double* trial
+        cdef double* sums
         cdef double time = 0.0, dt, largest, s, length, away
-        cdef Index i, flying = m, steps, refused = 0
-        cdef int stage, k, axis
-        if m > self.capacity:
-            free(self.work)
-            free(self.flying)
-            self.capacity = m
-            self.work = <double*>malloc((STAGES + 3) * 3 * m * sizeof(double))
-            self.flying = <Index*>malloc(m * sizeof(Index))
-            if self.work == NULL or self.flying == NULL:
-                with gil:
-                    raise MemoryError
+        cdef Index i, j, flying = m, steps, refused = 0
+        cdef int stage, axis
+        self.reserve(m)
         a, x = self.work, self.work + STAGES * 3 * m
-        v, trial = x + 3 * m, x + 6 * m
+        v, trial, sums = x + 3 * m, x + 6 * m, x + 9 * m
+        for j in range(3 * m):
+            x[j], v[j], a[j] = positions[j], velocities[j], 0.0
         for i in range(m):
             outcome[i] = ION_NEVER_LEFT
-            for axis in range(3):
-                x[3 * i + axis] = positions[3 * i + axis]
-                v[3 * i + axis] = velocities[3 * i + axis]
-                a[3 * i + axis] = 0.0
-        # a first step of a tenth of an atomic distance, from the acceleration at the start
         self.gather(m, x, v, a, outcome, 0.0)
-        self.evaluate(m, x, a, outcome)
+        self.evaluate(m, x, a, outcome, 0)
+        # a first step of an atomic distance at most, from the acceleration at the start
         dt = 1e30
         for i in range(m):
             s = sqrt(a[3 * i] ** 2 + a[3 * i + 1] ** 2 + a[3 * i + 2] ** 2)
             length = sqrt(v[3 * i] ** 2 + v[3 * i + 1] ** 2 + v[3 * i + 2] ** 2)
-            dt = min(dt, 0.2 * self.length / (length + sqrt(0.2 * self.length * s) + 1e-30))
+            dt = min(dt, 2.0 * self.length / (length + sqrt(2.0 * self.length * s) + 1e-30))
         for steps in range(self.max_steps):
-            # stages i of the step: positions x + dt (c_i v + dt sum_k a_ik f_k), and the accelerations f_i there
+            # stages of the step: positions x + dt (c_i v + dt sum_k a_ik f_k), and the accelerations f_i there
             dt = min(dt, self.time_to_reach(m, x, v, outcome))
             self.gather(m, x, v, a, outcome, dt)
             for stage in range(1, STAGES):   # the last stage of a step is the first of the next one
-                for i in range(m):
-                    if outcome[i] == ION_NEVER_LEFT:
-                        for axis in range(3):
-                            s = 0.0
-                            for k in range(stage):
-                                s += STAGE[9 * stage + k] * a[3 * (k * m + i) + axis]
-                            trial[3 * i + axis] = x[3 * i + axis] + dt * (NODE[stage] * v[3 * i + axis] + dt * s)
-                self.evaluate(m, trial, a + 3 * m * stage, outcome)
+                weighted_sum(3 * m, stage, &STAGE[9 * stage], a, 3 * m, sums)
+                for j in range(3 * m):
+                    trial[j] = x[j] + dt * (NODE[stage] * v[j] + dt * sums[j])
+                self.evaluate(m, trial, a + 3 * m * stage, outcome, stage)
             # accept the step if the largest error is below the tolerance: v += dt sum_k b_k f_k
-            largest = 0.0
-            for i in range(m):
-                if outcome[i] == ION_NEVER_LEFT:
-                    largest = max(largest, self.step_error(i, m, dt, a, v, positions, trial))
+            largest = self.step_error(m, dt, a, v, positions, trial, sums, outcome)
             self.n_steps += 1
             if largest <= 1.0:
                 refused = 0
                 time += dt
+                weighted_sum(3 * m, STAGES, VELOCITY, a, 3 * m, sums)
                 for i in range(m):
                     if outcome[i] != ION_NEVER_LEFT:
                         continue
                     away = 0.0
                     for axis in range(3):
-                        s = 0.0
-                        for k in range(STAGES):
-                            s += VELOCITY[k] * a[3 * (k * m + i) + axis]
                         x[3 * i + axis] = trial[3 * i + axis]
-                        v[3 * i + axis] += dt * s
+                        v[3 * i + axis] += dt * sums[3 * i + axis]
                         away += (x[3 * i + axis] - self.centre[axis]) ** 2
                         a[3 * i + axis] = a[3 * (8 * m + i) + axis]
                     if away > self.reach * self.reach:
@@ -393,6 +408,21 @@ cdef class Flights:
                 end[7 * i + 6] = time
         return 0
 
+    cdef int reserve(self, Index m) except -1 nogil:
+        # Memory for m flights.
+        if m > self.capacity:
+            free(self.work)
+            free(self.lanes)
+            free(self.flying)
+            self.capacity = m
+            self.work = <double*>malloc((STAGES + 4) * 3 * m * sizeof(double))
+            self.lanes = <float*>malloc(6 * (m + SINGLE_LANES) * sizeof(float))
+            self.flying = <Index*>malloc(m * sizeof(Index))
+            if self.work == NULL or self.lanes == NULL or self.flying == NULL:
+                with gil:
+                    raise MemoryError
+        return 0
+
     cdef double time_to_reach(self, Index m, const double* x, const double* v,
                               const signed char* outcome) noexcept nogil:
         # Time in which the slowest flight close to `reach` crosses it in a straight line, so that no flight ends far
@@ -413,86 +443,142 @@ cdef class Flights:
                 longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
         return 1.0001 * longest
 
-    cdef double step_error(self, Index i, Index m, double dt, const double* a, const double* v, const double* origin,
-                           const double* trial) noexcept nogil:
-        # Largest error of the step, relative to the tolerance.
-        cdef double dx, dv, ex = 0.0, ev = 0.0, path = 0.0, speed = 0.0, new
-        cdef int axis, k
-        for axis in range(3):
-            dx = dv = 0.0
-            new = v[3 * i + axis]
-            for k in range(STAGES):
-                dx += POSITION_ERROR[k] * a[3 * (k * m + i) + axis]
-                dv += VELOCITY_ERROR[k] * a[3 * (k * m + i) + axis]
-                new += dt * VELOCITY[k] * a[3 * (k * m + i) + axis]
-            ex += dx * dx
-            ev += dv * dv
-            path += (trial[3 * i + axis] - origin[3 * i + axis]) ** 2
-            speed += new * new
-        ex = dt * dt * sqrt(ex) / (self.tolerance * (sqrt(path) + 0.1 * self.length))
-        ev = dt * sqrt(ev) / (self.tolerance * sqrt(speed))
-        return max(ex, ev) if ex == ex and ev == ev else INFINITY
+    cdef double step_error(self, Index m, double dt, const double* a, const double* v, const double* origin,
+                           const double* trial, double* sums, const signed char* outcome) noexcept nogil:
+        # Largest error of the step of all flights, relative to the tolerance.
+        cdef double s, path, speed, largest = 0.0
+        cdef Index i
+        cdef int axis
+        weighted_sum(3 * m, STAGES, POSITION_ERROR, a, 3 * m, sums)
+        for i in range(m):
+            if outcome[i] == ION_NEVER_LEFT:
+                s = path = 0.0
+                for axis in range(3):
+                    s += sums[3 * i + axis] ** 2
+                    path += (trial[3 * i + axis] - origin[3 * i + axis]) ** 2
+                s = dt * dt * sqrt(s) / (self.tolerance * (sqrt(path) + 0.1 * self.length))
+                largest = max(largest, s) if s == s else INFINITY
+        weighted_sum(3 * m, STAGES, VELOCITY_ERROR, a, 3 * m, sums)
+        for i in range(m):
+            if outcome[i] == ION_NEVER_LEFT:
+                s = speed = 0.0
+                for axis in range(3):
+                    s += sums[3 * i + axis] ** 2
+                    # the acceleration at the end of the step is that of the last stage
+                    speed += (v[3 * i + axis] + 0.5 * dt * (a[3 * i + axis] + a[3 * (8 * m + i) + axis])) ** 2
+                s = dt * sqrt(s) / (self.tolerance * sqrt(speed))
+                largest = max(largest, s) if s == s else INFINITY
+        return largest
 
     cdef int gather(self, Index m, const double* x, const double* v, const double* a, const signed char* outcome,
                     double dt) except -1 nogil:
         # Collects the sources for a ball that contains all flights until the end of the step.
-        cdef double cx = 0.0, cy = 0.0, cz = 0.0, radius = 0.0, far, dx, dy, dz
-        cdef double[3] origin, point
+        cdef double[4] whole
+        cdef double[4 * PARTS] balls
+        cdef double[3] point
         cdef double[3 * SAMPLES] samples
+        cdef double largest = 0.0
         cdef Index i, n = 0
+        cdef int part, axis
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
+                self.flying[n] = i
                 n += 1
-                cx += x[3 * i] + 0.5 * dt * (v[3 * i] + 0.5 * dt * a[3 * i])
-                cy += x[3 * i + 1] + 0.5 * dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
-                cz += x[3 * i + 2] + 0.5 * dt * (v[3 * i + 2] + 0.5 * dt * a[3 * i + 2])
-        cx /= n
-        cy /= n
-        cz /= n
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                dx, dy, dz = x[3 * i] - cx, x[3 * i + 1] - cy, x[3 * i + 2] - cz
-                radius = max(radius, dx * dx + dy * dy + dz * dz)
-                dx += dt * (v[3 * i] + 0.5 * dt * a[3 * i])
-                dy += dt * (v[3 * i + 1] + 0.5 * dt * a[3 * i + 1])
-                dz += dt * (v[3 * i + 2] + 0.5 * dt * a[3 * i + 2])
-                radius = max(radius, dx * dx + dy * dy + dz * dz)
-        radius = sqrt(radius)
+        self.enclose(n, x, v, a, 0.0, dt, whole)
         if self.opening_angle == 0.0:
-            self.tree.collect(cx, cy, cz, radius, self.opening_angle, &self.sources)
+            self.tree.collect(whole[0], whole[1], whole[2], whole[3], self.opening_angle, &self.sources)
             return 0
-        self.expanded = n >= self.fewest and radius > 1e-3 * self.length
-        far = radius * (FAR if n < MANY else FAR_OF_MANY)
-        origin[0], origin[1], origin[2] = cx, cy, cz
-        self.tree.collect_single(origin, radius, self.opening_angle, far if self.expanded else INFINITY,
-                                 &self.sources, &self.near, &self.far)
-        if self.expanded:
-            self.far_field.centre[0], self.far_field.centre[1], self.far_field.centre[2] = cx, cy, cz
-            self.far_field.radius = 1.05 * radius   # a stage may lie a little outside
+        self.n_parts = 0
+        self.in_lanes = n >= self.fewest
+        if self.in_lanes and whole[3] > 1e-3 * self.length:
+            self.n_parts = PARTS
+            for part in range(PARTS):
+                self.enclose(n, x, v, a, BEGIN[part] * dt, END[part] * dt, balls + 4 * part)
+                largest = max(largest, balls[4 * part + 3])
+            if dt == 0.0 or largest > SPLIT * whole[3]:   # they would overlap
+                self.n_parts = 1
+                for axis in range(4):
+                    balls[axis] = whole[axis]
+            for part in range(self.n_parts):
+                self.expansions[part].radius = 1.05 * balls[4 * part + 3]   # a stage may lie a little outside
+                for axis in range(3):
+                    self.expansions[part].centre[axis] = balls[4 * part + axis]
+                    balls[4 * part + axis] -= whole[axis]
+                balls[4 * part + 3] *= FAR
+        self.tree.collect_single(whole, whole[3], self.opening_angle, self.n_parts, balls, &self.sources, &self.near,
+                                 &self.far)
+        if not self.in_lanes:
+            single_pad(&self.near)
+        if self.n_parts:
+            single_pad(&self.far)
+        for part in range(self.n_parts):
             for i in range(SAMPLES):
-                self.far_field.point(i, point)
+                self.far_field.point(&self.expansions[part], i, point)
                 single_field(&self.far, point[0], point[1], point[2], samples + 3 * i)
-            self.far_field.expand(samples)
+            self.far_field.expand(&self.expansions[part], samples)
             self.n_pairs += SAMPLES * (self.far.n_atoms + self.far.n_cells)
         return 0
 
-    cdef void evaluate(self, Index m, const double* x, double* a, const signed char* outcome) noexcept nogil:
-        # Accelerations [V/nm] of the unfinished flights.
-        cdef Index i, n = 0
+    cdef void enclose(self, Index n, const double* x, const double* v, const double* a, double begin, double end,
+                      double* ball) noexcept nogil:
+        # Centre and radius of a ball around all flights at two times of the step, and between.
+        cdef double s, first, last
+        cdef Index k, i
         cdef int axis
+        ball[0] = ball[1] = ball[2] = ball[3] = 0.0
+        for k in range(n):
+            i = 3 * self.flying[k]
+            for axis in range(3):
+                ball[axis] += (x[i + axis] + 0.5 * (begin + end) * v[i + axis]
+                               + 0.25 * (begin * begin + end * end) * a[i + axis])
+        for axis in range(3):
+            ball[axis] /= n
+        for k in range(n):
+            i = 3 * self.flying[k]
+            first = last = 0.0
+            for axis in range(3):
+                s = x[i + axis] - ball[axis]
+                first += (s + begin * (v[i + axis] + 0.5 * begin * a[i + axis])) ** 2
+                last += (s + end * (v[i + axis] + 0.5 * end * a[i + axis])) ** 2
+            ball[3] = max(ball[3], first, last)
+        ball[3] = sqrt(ball[3])
+
+    cdef void evaluate(self, Index m, const double* x, double* a, const signed char* outcome, int stage) noexcept nogil:
+        # Accelerations [V/nm] of the unfinished flights at the places of a stage.
+        cdef Index i, k, n = 0, width
+        cdef int axis
+        cdef float* field
         for i in range(m):
             if outcome[i] == ION_NEVER_LEFT:
-                if self.opening_angle > 0.0:
-                    single_field(&self.near, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
-                    self.n_pairs += self.near.n_atoms + self.near.n_cells
-                else:
-                    sources_field(&self.sources, x[3 * i], x[3 * i + 1], x[3 * i + 2], a + 3 * i)
-                    self.n_pairs += self.sources.n_atoms + self.sources.n_cells
                 self.flying[n] = i
                 n += 1
-        if self.opening_angle > 0.0 and self.expanded:
-            self.far_field.add(n, x, self.flying, a)
-        for i in range(n):
+        if self.opening_angle == 0.0:
+            for k in range(n):
+                i = 3 * self.flying[k]
+                sources_field(&self.sources, x[i], x[i + 1], x[i + 2], a + i)
+            self.n_pairs += n * (self.sources.n_atoms + self.sources.n_cells)
+        elif not self.in_lanes:
+            for k in range(n):
+                i = 3 * self.flying[k]
+                single_field(&self.near, x[i], x[i + 1], x[i + 2], a + i)
+            self.n_pairs += n * (self.near.n_atoms + self.near.n_cells)
+        else:
+            width = (n + SINGLE_LANES - 1) // SINGLE_LANES * SINGLE_LANES
+            field = self.lanes + 3 * width
             for axis in range(3):
-                a[3 * self.flying[i] + axis] *= self.coulomb
+                for k in range(width):   # the last flight fills the lanes
+                    i = 3 * self.flying[min(k, n - 1)]
+                    self.lanes[axis * width + k] = <float>(x[i + axis] - self.near.origin[axis])
+                    field[axis * width + k] = 0.0
+            bundle_atoms(self.near.n_atoms, self.near.capacity, self.near.atoms, width, self.lanes, field)
+            bundle_cells(self.near.n_cells, self.near.capacity, self.near.cells, width, self.lanes, field)
+            for axis in range(3):
+                for k in range(n):
+                    a[3 * self.flying[k] + axis] = field[axis * width + k]
+            self.n_pairs += n * (self.near.n_atoms + self.near.n_cells)
+            if self.n_parts:
+                add_expanded(&self.expansions[PART[stage] if self.n_parts > 1 else 0], n, x, self.flying, a)
+        for k in range(n):
+            for axis in range(3):
+                a[3 * self.flying[k] + axis] *= self.coulomb
         self.n_evaluations += n

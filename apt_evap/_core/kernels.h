@@ -1,9 +1,9 @@
 /* The hot sums: fields of point charges and of quadrupole cells; lengths in nm, charges in e, fields q r/r^3 in e/nm^2.
  *
- * Two layouts: `group_*` has 32 targets in the vector lanes and loops over the sources (a sweep),
+ * Three layouts: `group_*` has 32 targets in the vector lanes and loops over the sources (a sweep),
  * `point_*` has the sources in 8 lanes for one target (a field at a point), or in 16 lanes of single precision (a
- * flight). The lanes are fixed and nothing is contracted or reassociated (-ffp-contract=off), so the bits are the same
- * for SSE2, AVX2 and AVX-512.
+ * flight); `bundle_*` has 16 targets in the lanes (the flights of a group). The lanes are fixed and nothing is contracted
+ * or reassociated (-ffp-contract=off), so the bits are the same for SSE2, AVX2 and AVX-512.
  */
 #ifndef APT_EVAP_PAIR_H
 #define APT_EVAP_PAIR_H
@@ -63,6 +63,8 @@
 #undef REAL_SQRT
 #undef POINT_LANES
 #undef POINT_NAME
+
+#include "kernels_bundle.h"
 
 /* Values of three polynomials of the same degree at 16 points: coefficients of all x^i y^j z^k with i + j + k <= degree
  * (k fastest), for each component in turn. */

@@ -13,13 +13,23 @@ from libc.math cimport sqrt
 
 from apt_evap._core.index cimport Index
 from apt_evap._core.sources cimport (
-    CELL, LANES, SingleSources, Sources, single_pad, single_reserve, sources_field, sources_free, sources_grow,
+    CELL, LANES, SingleSources, Sources, single_reserve, sources_field, sources_free, sources_grow,
     sources_init, sources_potential,
 )
 
 import numpy as np
 
 import apt_evap._core.morton as morton
+
+
+cdef inline bint is_within(double x, double y, double z, int n_balls, const double* balls) noexcept nogil:
+    # Whether a point is in one of n balls (n, 4).
+    cdef int k
+    for k in range(n_balls):
+        if ((x - balls[4 * k]) ** 2 + (y - balls[4 * k + 1]) ** 2 + (z - balls[4 * k + 2]) ** 2
+                <= balls[4 * k + 3] * balls[4 * k + 3]):
+            return True
+    return False
 
 
 cdef class Octree:
@@ -319,10 +329,11 @@ cdef class Octree:
             sources.n_cells += 1
         return 0
 
-    cdef int collect_single(self, const double* centre, double radius, double opening_angle, double far_radius,
-                            Sources* sources, SingleSources* near, SingleSources* far) except -1 nogil:
-        # Copies the sources of a walk in single precision, relative to the centre: those within a radius, and the
-        # others.
+    cdef int collect_single(self, const double* centre, double radius, double opening_angle, int n_balls,
+                            const double* balls, Sources* sources, SingleSources* near, SingleSources* far
+                            ) except -1 nogil:
+        # Copies the sources of a walk in single precision, relative to the centre: those within one of n balls (n, 4),
+        # relative to the centre, too, and the others. Without balls all are near. The caller pads the lists.
         cdef SingleSources* part
         cdef double dx, dy, dz
         cdef const double* cell
@@ -334,7 +345,7 @@ cdef class Octree:
         for k in range(sources.n_atoms):
             slot = sources.atom[k]
             dx, dy, dz = self.x[slot] - centre[0], self.y[slot] - centre[1], self.z[slot] - centre[2]
-            part = near if dx * dx + dy * dy + dz * dz <= far_radius * far_radius else far
+            part = near if n_balls == 0 or is_within(dx, dy, dz, n_balls, balls) else far
             at = part.n_atoms
             part.atoms[at], part.atoms[part.capacity + at] = <float>dx, <float>dy
             part.atoms[2 * part.capacity + at], part.atoms[3 * part.capacity + at] = <float>dz, <float>self.q[slot]
@@ -344,15 +355,13 @@ cdef class Octree:
             dx, dy, dz = cell[0] - centre[0], cell[1] - centre[1], cell[2] - centre[2]
             if cell[3] == 0.0:
                 continue   # a leaf whose atoms were removed: a flight may start at its place
-            part = near if dx * dx + dy * dy + dz * dz <= far_radius * far_radius else far
+            part = near if n_balls == 0 or is_within(dx, dy, dz, n_balls, balls) else far
             at = part.n_cells
             part.cells[at], part.cells[part.capacity + at] = <float>dx, <float>dy
             part.cells[2 * part.capacity + at] = <float>dz
             for m in range(3, CELL):
                 part.cells[m * part.capacity + at] = <float>cell[m]
             part.n_cells = at + 1
-        single_pad(near)
-        single_pad(far)
         return 0
 
     cdef Index within(self, double px, double py, double pz, double radius, int* slots, Index most) noexcept nogil:

@@ -303,7 +303,7 @@ class Simulation:
         model = ResponseModel(self.response_settings, self.detector)
         limited, scouts = self.flight_settings.field_of_view is not None, None
         if responses:
-            groups += model.launches(emission_batch)
+            groups.append(model.launches(emission_batch))
             scouts = scouts_of(emission_batch, self.response_settings) if limited else None
         flight = self._flight_pool.start(batch, groups, scouts, len(emissions))
 
@@ -322,7 +322,7 @@ class Simulation:
                 fields=batch.fields,
                 perturbations=emissions,
                 flown=tuple(flown),
-                responses=model.fit(ends[len(emissions) :], slowness, apex, flown_ions) if responses else None,
+                responses=model.fit(ends[-1], slowness, apex, flown_ions) if responses else None,
                 seed=self.seed,
                 voltage=self.voltage,
                 detector=self.detector,

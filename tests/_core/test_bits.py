@@ -25,8 +25,9 @@ int main(void)
     static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
     static int list[N];
     int range[2] = {0, N};
-    float targets[3 * GROUP], sums[3 * GROUP] = {0}, dot;
-    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0};
+    static float columns[CELL * N];
+    float targets[3 * GROUP], sums[3 * GROUP] = {0}, bundle[3 * GROUP] = {0}, dot;
+    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0}, totals[100];
     static double multipoles[MULTIPOLE * N];
     static float row_potential[N], zero[GROUP];
     double potentials[GROUP] = {0}, zeros[GROUP] = {0};
@@ -36,7 +37,7 @@ int main(void)
         fx[i] = x[i] = drand48() * 10, fy[i] = y[i] = drand48() * 10, fz[i] = z[i] = drand48() * 10;
         q[i] = drand48(), fq[i] = q[i] - 0.5, list[i] = i;
         for (int j = 0; j < CELL; j++)
-            cells[CELL * i + j] = drand48();
+            columns[CELL * i + j] = cells[CELL * i + j] = drand48();
     }
     for (int l = 0; l < 3 * GROUP; l++)
         wide[l] = targets[l] = drand48();
@@ -46,6 +47,9 @@ int main(void)
     group_cells_double(N, list, cells, origin, wide, wide_sums);
     point_atoms_double(N - 3, x, y, z, q, 5, 5, 12, e);
     point_cells_double(N, N, cells, 5, 5, 12, e);
+    bundle_atoms(N - 3, N, columns, GROUP, targets, bundle);
+    bundle_cells(N - 3, N, columns, GROUP, targets, bundle);
+    weighted_sum(99, N / 100, x, y, 100, totals);
     patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
@@ -60,6 +64,7 @@ int main(void)
     patch_potential_and_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential, px, py, pz);
     add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
+    add(bundle, sizeof bundle), add(totals, 99 * sizeof totals[0]);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);
     return 0;

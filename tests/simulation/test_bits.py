@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "cf147b8e5b959b5e1d3ad025365e96ca34017d6c951664004070ddf3a9b96077"
+FINGERPRINT = "9ab4c31cd309fa4185299e41475db31ad6af0ee18429e64f79011b15110e6bb2"
 PROGRAM = """
 import warnings
 

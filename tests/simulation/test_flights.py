@@ -89,7 +89,7 @@ def test_at_rest_in_the_field_of_a_charge():
 
 def test_order_of_one_step():
     """One step h of a scheme of order p misses the closed form by h^(p + 1); the scheme is a Nystrom pair 8(6)."""
-    lengths = 1.8 * 2.0 ** -np.arange(0.0, 2.5, 0.5)
+    lengths = 0.18 * 2.0 ** -np.arange(0.0, 2.5, 0.5)
     outwards = np.array([[0.5, 0.8, 0.1]])
     steps, errors = [], []
     for length in lengths:  # the first step is set by a length; a tolerance without bound accepts it
@@ -311,6 +311,68 @@ def test_flights_that_share_their_steps(scene, tip12):
     error = np.linalg.norm(landing(alone, tip12.apex) - landing(together, tip12.apex), axis=1)
     assert error.max() < 0.02  # both within 0.01 mm of the exact place
     assert np.median(error) < 0.002
+
+
+def test_sums_with_the_flights_in_the_vector_lanes(scene, tip12):
+    """A group at one place has the accelerations of a single flight there, whose sums have the sources in the lanes."""
+    atoms, charges, starts, _ = scene
+    tree = Octree(atoms, charges)
+    for opening_angle, height in ((1e-3, 0.3), (0.3, 0.3), (0.3, 30.0)):  # atoms; near cells too; cells only
+        flights = fly(tree, starts[:1], 0 * starts[:1], **options(tip12, opening_angle=opening_angle))[2]
+        for n in (6, 16, 17, 40):
+            offsets = 1e-5 * np.random.default_rng(n).normal(size=(n, 3))
+            places = starts[1] + [0.0, 0.0, height] + offsets
+            together = flights.accelerations(places)
+            alone = np.concatenate([flights.accelerations(place[None]) for place in places])
+            # the gradients are below 1e3 V/nm^2; single precision
+            np.testing.assert_allclose(together, alone, rtol=0, atol=3e-6 * np.linalg.norm(alone, axis=1).max())
+            assert not np.array_equal(together[0], together[1])
+
+
+def test_the_field_of_a_group_against_direct_sums(scene, tip12):
+    """Near sources and the expansion of distant ones, for launches that lie up to 0.3 nm apart."""
+    atoms, charges, starts, _ = scene
+    tree = Octree(atoms, charges)
+    for height, bound in ((0.0, 2e-4), (2.0, 5e-5), (20.0, 5e-5)):
+        flights = fly(tree, starts[:1], 0 * starts[:1], **options(tip12, opening_angle=0.3))[2]
+        places = starts[1] + [0.0, 0.0, height] + np.random.default_rng(3).uniform(-0.15, 0.15, size=(50, 3))
+        expected = COULOMB * twins.field(places, atoms, charges)
+        error = np.linalg.norm(flights.accelerations(places) - expected, axis=1) / np.linalg.norm(expected, axis=1)
+        assert error.max() < bound  # measured 9e-5, 1e-5 and 2e-5
+
+
+def test_a_bundle_lands_where_its_launches_do_alone(scene, tip12):
+    """The launches of wide responses, from places 0.3 nm apart, against exact sums for each alone."""
+    atoms, charges, starts, _ = scene
+    tree, random = Octree(atoms, charges), np.random.default_rng(8)
+    starts = starts[1] + random.uniform(-0.12, 0.12, size=(60, 3)) + [0.0, 0.0, 0.1]
+    push = random.normal(size=(60, 3)) * 0.7
+    together, outcome, _ = fly(tree, starts, push, groups=[0, 60], **options(tip12, opening_angle=0.3))
+    assert (outcome == LEFT).all()
+    exact, *_ = fly(tree, starts[::6], push[::6], **options(tip12, tolerance=1e-9))
+    error = np.linalg.norm(landing(together[::6], tip12.apex) - landing(exact, tip12.apex), axis=1)
+    assert np.median(error) < 0.002  # mm; measured 0.0008
+    assert error.max() < 0.003  # measured 0.0014
+
+
+def test_a_bundle_above_a_dense_sphere():
+    """It leaves radially, with the energy of the field of a sphere."""
+    n, radius = 20_000, 7.0
+    k = np.arange(n) + 0.5
+    z, azimuth = 1 - 2 * k / n, np.pi * (1 + np.sqrt(5)) * k
+    tree = Octree(
+        radius * np.stack([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z], axis=1),
+        np.full(n, 0.1),
+    )
+    starts = np.array([7.2, 2.0, 0.5]) + np.random.default_rng(1).uniform(-0.15, 0.15, size=(40, 3))
+    end, outcome, _ = fly(tree, starts, np.zeros((40, 3)), groups=[0, 40], opening_angle=0.3)
+    assert (outcome == LEFT).all()
+    away = np.linalg.norm(np.cross(starts, end[:, :3]), axis=1)
+    away /= np.linalg.norm(starts, axis=1) * np.linalg.norm(end[:, :3], axis=1)
+    energy = 0.5 * np.linalg.norm(end[:, 3:6], axis=1) ** 2 + COULOMB * 0.1 * n / np.linalg.norm(end[:, :3], axis=1)
+    error = np.abs(energy / (COULOMB * 0.1 * n / np.linalg.norm(starts, axis=1)) - 1)
+    assert away.max() < 4e-5  # measured 1.5e-5
+    assert error.max() < 1.5e-5  # measured 4e-6
 
 
 def test_flights_follow_the_events(tip12):

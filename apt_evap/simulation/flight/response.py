@@ -12,7 +12,6 @@ the detector.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -218,8 +217,10 @@ class ResponseModel:
     def __init__(self, settings: ResponseSettings, detector: Detector) -> None:
         self.settings, self.detector = settings, detector
 
-    def launches(self, emissions: Emissions) -> list[tuple[Floats, Floats]]:
-        """Launches of the designs, from the site and from the rolled-up positions.
+    def launches(self, emissions: Emissions) -> tuple[Floats, Floats]:
+        """Launches of the designs, from the site and then from the rolled-up positions: one group of flights.
+
+        These places are 0.3 nm apart, so the launches of an ion soon fly in one narrow tube.
 
         Parameters
         ----------
@@ -228,12 +229,12 @@ class ResponseModel:
 
         Returns
         -------
-        list of (ndarray, ndarray)
-            Positions [nm] and velocities [sqrt(V)] of each design, shape (n, m, 3); NaN for ions that cannot roll up.
+        positions, velocities : ndarray, shape (n, m, 3)
+            Positions [nm] and velocities [sqrt(V)]; NaN for ions that cannot roll up.
         """
         settings, n = self.settings, len(emissions)
         fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)[:, None]
-        groups = []
+        positions, velocities = [], []
         for rolled, design in zip((False, True), settings.designs, strict=True):
             launches = np.zeros((len(design.launches), len(VARIABLES)))
             launches[:, list(design.columns)] = design.launches
@@ -247,19 +248,21 @@ class ResponseModel:
                 starts = np.broadcast_to(rolled_positions(emissions)[:, None], (n, len(launches), 3))
             if settings.is_wide:
                 starts = starts + (settings.height * launches[:, HEIGHT])[:, None] * emissions.normals[:, None]
-            velocities = along_surface(
-                emissions.normals, fastest * launches[:, FIRST_VELOCITY], fastest * launches[:, SECOND_VELOCITY]
+            positions.append(starts)
+            velocities.append(
+                along_surface(
+                    emissions.normals, fastest * launches[:, FIRST_VELOCITY], fastest * launches[:, SECOND_VELOCITY]
+                )
             )
-            groups.append((starts, velocities))
-        return groups
+        return np.concatenate(positions, axis=1), np.concatenate(velocities, axis=1)
 
-    def fit(self, ends: Sequence[Ends], slowness: Floats, apex: float, flown: Booleans | None = None) -> Responses:
+    def fit(self, ends: Ends, slowness: Floats, apex: float, flown: Booleans | None = None) -> Responses:
         """Fit the polynomials to the ends of the launches.
 
         Parameters
         ----------
-        ends : sequence of Ends
-            Ends of the launches of the designs, for n ions.
+        ends : Ends
+            Ends of the launches, for n ions.
         slowness : ndarray, shape (n,)
             See `Emissions.slowness`.
         apex : float
@@ -272,9 +275,15 @@ class ResponseModel:
         Responses
         """
         rows = slice(None) if flown is None else flown
+        all_directions, all_times = land(ends.rows(rows), slowness[rows], self.detector, apex)
+        first_of_rolled = [len(self.settings.site.launches)]
         coefficients, residuals = [], []
-        for design, flights in zip(self.settings.designs, ends, strict=True):
-            directions, times = land(flights.rows(rows), slowness[rows], self.detector, apex)
+        for design, directions, times in zip(
+            self.settings.designs,
+            np.split(all_directions, first_of_rolled, axis=1),
+            np.split(all_times, first_of_rolled, axis=1),
+            strict=True,
+        ):
             n, m = times.shape
             values = fit_quantities(directions.reshape(-1, 2), times.ravel()).reshape(n, m, 3)
             polynomials, residual = design.fit(values)
