@@ -121,8 +121,9 @@ def write_example() -> None:
     projection = Projection(25.0, (-3.0, 1.5))
     counts = master_patterns("fcc")[0].map(orientation, projection, width=34.0, ions=80_000, rolled=0.5, seed=1)
     with replace_file(path) as file:
-        edges = {"x_edges_mm": counts.x_edges, "y_edges_mm": counts.y_edges}
-        np.savez_compressed(file, counts=counts.values, inside=counts.mask, **edges)
+        np.savez_compressed(
+            file, counts=counts.values, inside=counts.mask, x_edges_mm=counts.x_edges, y_edges_mm=counts.y_edges
+        )
 
 
 def files_to_open() -> list[str]:
