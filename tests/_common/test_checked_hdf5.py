@@ -74,6 +74,7 @@ def test_every_changed_bit_is_noticed(path, run, flips):
     assert n_same <= 1 + flips // 150  # measured: 1 of 600
 
 
+@pytest.mark.slow
 def test_zeros_cuts_and_insertions_are_noticed(path, run):
     """Zeros from the beginning of a chunk to its end as well: their checksum is not zero."""
     whole = path.read_bytes()

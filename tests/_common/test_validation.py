@@ -858,6 +858,7 @@ print(json.dumps([memory("VmHWM") - before, len(tip), len(emitter)]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux says how much memory was used")
 @pytest.mark.parametrize("shape", [{"apex_radius": 6.0}, {"apex_radius": 8.0, "depth": 2.0}])
 def test_the_memory_foreseen_is_the_memory_taken(shape, monkeypatch):

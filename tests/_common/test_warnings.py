@@ -10,6 +10,7 @@ import apt_evap as ae
 PACKAGE = Path(ae.__file__).parent
 
 
+@pytest.mark.slow
 def test_every_warning_goes_through_one_function():
     for path in PACKAGE.rglob("*.py"):
         if path != PACKAGE / "warnings.py":
@@ -17,6 +18,7 @@ def test_every_warning_goes_through_one_function():
             assert "warnings.warn" not in calls, path
 
 
+@pytest.mark.slow
 def test_a_warning_names_the_line_of_the_caller(tmp_path, small_tip):
     """Whatever is between: a method, a generator, a context manager, a dispatch by the format."""
     hits = ae.Hits(x=np.array([1.0, np.nan]), y=np.array([1.0, 2.0]), voltage=np.array([5.0, 6.0]))

@@ -133,6 +133,7 @@ def test_smooth_surfaces_have_the_charges_of_robin():
 # ---- the dense twin ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gaussian", [False, True])
 def test_charges_are_those_of_the_dense_matrix(small_tip, gaussian):
     rule = ae.ConstantPotential(self_term=None if not gaussian else 9.0, charges="gaussian" if gaussian else "points")

@@ -39,6 +39,7 @@ def thousand(tip20):
     return emitter.counts, drift(emitter), emitter
 
 
+@pytest.mark.slow
 def test_charges_after_a_thousand_events(thousand):
     # the smooth remainder, 7e-6 of the mean charge an event (measured by direct sums at 15,000 atoms), over the
     # events between two relaxations (a fortieth of the surface) is 3e-3 at its worst; asked are 2e-3 and 2e-2
@@ -75,6 +76,7 @@ def test_a_larger_patch_is_better(tip12):
     assert errors[2][0] < errors[0][0] / 2  # the change of charge falls off as the cube of the distance
 
 
+@pytest.mark.slow
 def test_relaxing_more_often_is_better(tip12):
     errors = []
     for interval in (300, 50, 10):
@@ -91,6 +93,7 @@ def test_hardly_a_charge_is_clipped(thousand):
     assert counts["clipped"] <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [ae.Robin(), ae.ConstantPotential()], ids=["Robin", "potential"])
 def test_small_tips_keep_their_potential(nickel, rule):
     """R = 7 a: potential in the centre and charges of the cap against converged ones, as flights see them.
@@ -330,6 +333,7 @@ def test_exhausted(nickel, small_tip):
     assert len(sites) >= 10
 
 
+@pytest.mark.slow
 def test_too_shallow(nickel):
     tip = ae.Tip(nickel, apex_radius=7 * nickel.a, axis=(1, 1, 1), depth=4 * nickel.a)
     emitter = ae.evaporation.Emitter(tip)

@@ -171,6 +171,7 @@ def test_order_is_that_of_the_keys(crowd, n_threads):
     assert np.array_equal(keys, expected[order])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leaf_size", [1, 16, 5000])
 def test_nodes_are_those_of_a_plain_recursion(crowd, leaf_size):
     _, keys = morton_order(crowd)

@@ -43,6 +43,7 @@ def tree(tip12):
     return tree
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [False, True])
 def test_only_targets_get_a_field(tree, samples):
     disturbed = np.zeros(tree.capacity, np.int8)
@@ -94,6 +95,7 @@ def errors(emitter, tolerance):
     return np.sqrt(np.mean(error**2)), np.abs(error).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rule", "tolerance"), [(RULES[0], 1e-9), (RULES[1], 1e-6)], ids=["Robin", "potential"])
 def test_a_part_is_solved_as_well_as_the_whole(tip20, rule, tolerance):
     emitters = [emitter_of(tip20, rule, sweep_interval=100, tolerance=1e-3) for _ in range(3)]
@@ -114,6 +116,7 @@ def test_a_part_is_solved_as_well_as_the_whole(tip20, rule, tolerance):
     assert rms_part < rms_whole + 2e-4 and largest_part < largest_whole + 4e-3
 
 
+@pytest.mark.slow
 def test_charges_far_away(tip20):
     """Fixed by a constant potential; with Robin's charges, a smooth multiple, since all depend on the area per atom."""
     for rule in RULES:
@@ -133,6 +136,7 @@ def test_charges_far_away(tip20):
             assert 1e-5 < abs(ratio.mean() - 1) < 3e-3 and ratio.std() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES, ids=["Robin", "potential"])
 def test_the_sequence_is_that_of_relax_due(tip12, rule):
     one, other, whole, always = (emitter_of(tip12, rule, whole_interval=n) for n in (3, 3, 1, 1))
@@ -150,6 +154,7 @@ def test_the_sequence_is_that_of_relax_due(tip12, rule):
     assert np.array_equal(whole.charges, always.charges)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES, ids=["Robin", "potential"])
 def test_a_state_between_relaxations_of_parts(tip12, rule):
     emitter = emitter_of(tip12, rule)
@@ -177,6 +182,7 @@ def test_a_thermal_state_between_relaxations_of_parts(tip12):
     assert np.array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_threads_change_no_bit(tip20):
     charges = []
     for n_threads in (1, 2):

@@ -69,6 +69,7 @@ def sphere():
     return ae.evaporation.Emitter(tip, rule=Even())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("voltage", [None, 250.0])
 def test_a_smooth_sphere_is_uniform(sphere, voltage):
     """V R / r is the potential: the distance, the field and the brightness have closed forms."""
@@ -125,6 +126,7 @@ def test_kinks_are_brighter_than_ledges_and_terraces(evolved, gas):
     assert max(medians) / min(medians) < 2  # the field on the critical surface does not tell the sites apart
 
 
+@pytest.mark.slow
 def test_rings_about_the_pole(tip20):
     """Terraces from the pole to the angle psi: R (1 - cos(psi)) / d."""
     image = ae.analysis.field_ion_image(ae.evaporation.Emitter(tip20), half_angle=58.0)

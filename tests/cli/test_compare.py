@@ -62,6 +62,7 @@ def failed(capsys, *arguments):
     return err.replace(os.sep, "/")
 
 
+@pytest.mark.slow
 @MODES
 @NO_PICTURES
 def test_files_that_are_overwritten_keep_their_modes(folder):
@@ -116,6 +117,7 @@ def test_everything_is_written(folder, capsys, rough_layout):
     assert held == study.to_dict()
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_folder_of_its_own_is_written_again(folder, capsys):
     arguments = ["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE, "--quiet"]
@@ -143,6 +145,7 @@ def test_files_of_others_are_kept(folder, capsys):
     assert "cannot write 'none/study'" in failed(capsys, "run.h5", "map.npz", "-o", "none/study")
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_ions_and_runs_are_taken_too(folder):
     assert main(["compare", "run.h5", "ions.epos", *QUICK, *HERE, "--quiet", "--mechanism", "lateral"]) == 0
@@ -153,6 +156,7 @@ def test_ions_and_runs_are_taken_too(folder):
     assert "RollUp" in json.loads(Path("again/study.json").read_text())["settings"]["measured"]
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_registration_from_a_file(folder, capsys):
     turned = ae.Registration(20.0, 0.9, (1.0, -2.0), True)
@@ -205,6 +209,7 @@ def test_what_is_refused(folder, capsys, arguments, sentence):
     assert sentence in failed(capsys, *arguments, *([] if "--registration" in arguments else HERE))
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_measured_ions_are_selected(folder, capsys):
     arguments = ["run.h5", "ions.epos", *QUICK, *HERE, "--quiet"]

@@ -26,6 +26,7 @@ def test_an_image_of_a_run(run, capsys, blank_pictures):
     assert "surface atoms in Ne at " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_image_is_grey(run, tmp_path):
     """Also its bar: brightness is not a density of hits."""
     assert main(["map", "ni.h5", "--field-ion", "Ne", "--bins", "64", "-o", "image.png"]) == 0

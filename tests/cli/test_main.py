@@ -216,6 +216,7 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
     assert sorted(os.listdir()) == ["small.h5", "small.png", "small.toml"]
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
@@ -299,6 +300,7 @@ def test_wrong_configs_are_one_sentence(folder, made, capsys):
     assert f"'{made.as_posix()}' is a run: see apt-evap info" in failed(capsys, "run", made)
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_run_that_ends_early_says_why(folder, capsys):
     (folder / "small.toml").write_text(SMALL.replace("6 a", "3 a") + "responses = false\n")
@@ -337,6 +339,7 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert os.listdir() == ["small.toml"]
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_progress_without_a_terminal_is_plain_lines(folder, capsys, monkeypatch):
     monkeypatch.setattr(_progress, "SECONDS_BETWEEN_LINES", 0.0)
@@ -443,6 +446,7 @@ def test_map_of_a_run_under_any_perturbation(folder, made, monkeypatch):
     assert drawn_by(monkeypatch, "map", made, "-o", "a.pdf")[1] != titles  # overwrites its own
 
 
+@pytest.mark.slow
 def test_a_run_is_drawn_with_the_maps_of_its_config(folder, monkeypatch):
     panels = (
         '[maps]\nbins = 24\nsmoothing = 20\n[[maps.panels]]\ntitle = "side"\nperturbation = "LateralVelocity:0.3"\n'
@@ -763,6 +767,7 @@ def test_an_output_that_is_no_regular_file_is_refused(folder, capsys, name):
     assert f"cannot write '{name}': Not a regular file" in failed(capsys, "run", "small.toml", option, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend_inline", "nope"])
 def test_pictures_do_not_need_the_backend_of_the_shell(made, folder, backend):
     """A terminal of a notebook sets a backend, which other environments do not have."""

@@ -28,6 +28,7 @@ def test_poles_of_a_run_are_its_own(drawn, small_tip, capsys):
         assert main(["map", "small.h5", "-o", "b.png", *wrong]) == 2 and "--poles" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_poles_of_a_measured_map_are_searched_or_given(drawn, capsys):
     truth, projection = ae.Orientation("W", (0.05, 0.66, 0.74), 30.0), ae.detection.Projection(60.0)
     pattern = ae.maps.master_patterns("bcc")[0]

@@ -50,6 +50,7 @@ def summary(path, capsys):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_a_run_at_a_temperature_is_saved_in_real_units(made, capsys):
     run = ae.load(made / "hot.h5")
     assert run.settings["law"]["temperature"] == 80.0 and run.settings["control"]["rate"] == 0.02
@@ -64,6 +65,7 @@ def test_a_run_at_a_temperature_is_saved_in_real_units(made, capsys):
     assert "Arrhenius(temperature=80" in text and "operating field [V/nm]" in text
 
 
+@pytest.mark.slow
 def test_a_settings_file_with_a_microscope(made, tmp_path, monkeypatch, capsys):
     """The run is saved behind the lens, as --lens shows a run that is not."""
     monkeypatch.chdir(tmp_path)
@@ -100,6 +102,7 @@ def test_info_of_a_run_at_the_simulated_voltage(made, capsys):
     assert told["real_units"] is None and told["clock"] is None and told["law"]["name"] == "Extremal"
 
 
+@pytest.mark.slow
 def test_a_run_says_its_real_units(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "hot.toml").write_text(HOT)
@@ -113,6 +116,7 @@ def test_a_run_says_its_real_units(tmp_path, monkeypatch, capsys):
     assert np.array_equal(longer.clock.waits[:60], first.clock.waits)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of a small specimen: below 100 V
 def test_a_map_in_real_units(made, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

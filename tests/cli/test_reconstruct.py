@@ -119,6 +119,7 @@ def radius5(tmp_path_factory):
     return run, path
 
 
+@pytest.mark.slow
 def test_the_constants_of_a_run_are_its_own(radius5, tmp_path, monkeypatch, capsys):
     run, path = radius5
     monkeypatch.chdir(tmp_path)
@@ -162,6 +163,7 @@ def test_an_unknown_element_names_the_options_of_the_shell(measured, capsys):
     assert "Material(" not in told and told.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ions", [1, 2, 5, 49, 50])
 def test_few_ions_are_reconstructed(measured, tmp_path, capsys, ions):
     """A picture that nobody asked for does not stop them; one that is asked for is refused before a file is written."""

@@ -43,6 +43,7 @@ def shell(folder, redirection, *arguments, **environment):
     )
 
 
+@pytest.mark.slow
 @SHELL
 def test_a_run_without_stderr(folder):
     code, out, _ = shell(folder, "2>&-", "run", "small.toml")
@@ -50,6 +51,7 @@ def test_a_run_without_stderr(folder):
     assert sorted(os.listdir(folder)) == ["ions.epos", "small.h5", "small.png", "small.toml"]
 
 
+@pytest.mark.slow
 @SHELL
 @pytest.mark.parametrize("arguments", [("info", "ions.epos"), ("map", "ions.epos"), ("--version",)], ids=" ".join)
 def test_commands_without_stdout(folder, arguments):
@@ -74,12 +76,14 @@ def test_a_full_stderr_is_no_error(folder):
     assert shell(folder, "2>/dev/full", "info", "none.epos") == (2, "", "")
 
 
+@pytest.mark.slow
 def test_a_terminal_that_knows_ascii_alone(folder):
     os.rename(folder / "ions.epos", folder / "Å.epos")
     code, out, err = shell(folder, "", "map", "Å.epos", PYTHONIOENCODING="ascii", PYTHONUTF8="1")
     assert (code, out, err) == (0, "wrote \\xc5_map.png\n", "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(IS_WINDOWS, reason="Windows has no locale of ASCII")
 def test_a_locale_without_degree_signs(folder):
     """The C locale without its mode of UTF-8: ASCII, and another handler of errors than other locales have."""
@@ -108,6 +112,7 @@ def test_ctrl_c_while_libraries_are_loaded(folder):
     assert found == (130, "", "apt-evap: interrupted\n")
 
 
+@pytest.mark.slow
 def test_a_quiet_run_writes_nothing_to_stderr(folder):
     """In the development mode, which shows errors of finalisers in every version of Python."""
     mode = {"PYTHONDEVMODE": "1", "PYTHONWARNINGS": "ignore::DeprecationWarning"}  # other packages may have some

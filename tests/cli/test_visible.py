@@ -92,6 +92,7 @@ def test_wrong_settings_are_named(folder, capsys, old, new, word):
     assert not (folder / "operators.h5").exists()
 
 
+@pytest.mark.slow
 def test_stored_operators_are_those_of_the_settings(folder, capsys):
     """Whatever changes the operators is compared with those that are stored; the rest of the file is free."""
     path = folder / "particle.toml"

@@ -87,6 +87,7 @@ def test_folders_and_large_files_are_no_materials(folder):
             read_material(name)
 
 
+@pytest.mark.slow
 def test_commands_take_a_material_of_a_users_own(folder, rng, capsys):
     (folder / "mine.toml").write_text(f"[material]\n{LINES}\n")
     n = 300

@@ -102,6 +102,7 @@ def read(folder, text, responses="true"):
     return read_config(path)
 
 
+@pytest.mark.slow
 def test_a_perturbation_without_responses_is_flown(folder):
     text = """
 [[maps.panels]]

@@ -31,6 +31,7 @@ def independent():
 # ---- values ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_independent_code(independent):
     """Its k_f and xi at R = 50 nm, printed with three digits: within half a per cent, of the electrode's shape."""
     solved = [each.lens(50.0) for each in independent.values()]
@@ -145,6 +146,7 @@ def test_a_slow_twin_of_the_flights(lens):
         assert verlet(solved, math.radians(angle), 4000) == pytest.approx(fast, rel=3e-3)
 
 
+@pytest.mark.slow
 def test_the_table_agrees_with_solutions():
     """Between the radii of the table, which are powers of 2."""
     setting = LocalElectrode(40e3, 20e3, 8.0)
@@ -157,6 +159,7 @@ def test_the_table_agrees_with_solutions():
         np.testing.assert_allclose(setting.projection(radius).flight_angles(angles), flown, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_projection_is_nearly_straight(lens):
     """From 5 to 30 degrees theta' / theta is constant within 2 %: the equidistant projection."""
     angles = np.linspace(5.0, 30.0, 20)
@@ -268,6 +271,7 @@ def drawn():
     return LocalElectrode(40e3, 20e3, 5.0, detector_potential=4300.0)
 
 
+@pytest.mark.slow
 def test_the_potential_of_the_detector(lens, drawn):
     """Twin: a parabola in a uniform field."""
     energy, angle, length, extra, plain = 3000.0, 30.0, 100.0, 4300.0, lens
@@ -359,6 +363,7 @@ def test_a_narrow_aperture_has_nearly_the_same_lens(lens):
     assert narrow.compression == pytest.approx(wide.compression, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets(name):
     preset = LocalElectrode.preset(name, shank_angle=6.0)
@@ -366,6 +371,7 @@ def test_presets(name):
     assert preset.shank_angle == 6.0 and preset.distance == PRESETS[name]["distance"]
 
 
+@pytest.mark.slow
 def test_settings():
     setting = LocalElectrode(40e3, 20e3, 5.0, profile=[[0.0, 20.0], [100.0, 30.0]])
     setting.field_factor(50.0)  # what is kept is not a setting

@@ -122,6 +122,7 @@ def test_few_ions_make_no_map():
         result.select("Ni")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_peak_beside_those_of_the_element_is_another_ion(seed):
     """One isotope fits any single peak within the tolerance of a nominal length: N2+ is not a second Al+."""

@@ -81,6 +81,7 @@ class Constant:
 # ---- counts during the events --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "weight"), [("aluminium_copper", 0.0), ("aluminium_copper", 0.4), ("iron_tungsten", 0.5)]
 )
@@ -128,6 +129,7 @@ def slow_fields(tip, atoms, nearest, second, weight=0.0, ordering=0.0):
     return tip.evaporation_fields[own] * ((total + s) / (e + s)) ** 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "weight", "ordering"),
     [("aluminium_copper", 0.0, 0.05), ("aluminium_copper", 0.0, -0.1), ("iron_tungsten", 0.5, 0.0)],

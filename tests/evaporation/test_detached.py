@@ -45,6 +45,7 @@ def check_alloy(name, n_events, step):
     return emitter, fresh
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALLOYS)
 def test_nothing_floats(name):
     check_alloy(name, 1500, 100)
@@ -89,6 +90,7 @@ def test_parts_that_meet_elsewhere_stay():
     assert atoms.waiting_atoms.tolist() == [4, 5, 6, 7, 8]
 
 
+@pytest.mark.slow
 def test_a_run_with_detached_atoms_is_resumed_with_the_same_bits(tmp_path):
     tip = ae.Tip("Al", 2.0, (1, 1, 1), shank_length=5.0, solutes={"W": 0.1}, seed=1)
     whole = ae.Simulation(tip, n_threads=1).run(600, responses=False, progress=False)

@@ -25,6 +25,7 @@ def by_hand(emitter, n):
     return np.concatenate(sites)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch_size", [1, 7, 256])
 def test_advance_is_the_loop(nickel, batch_size):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)

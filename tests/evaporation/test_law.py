@@ -112,6 +112,7 @@ def hopping_keys(emitter, law, every=False):
     return keys * (factor if every else np.maximum(factor, 1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [ae.Robin(), ae.ConstantPotential()])
 def test_the_next_atom_of_the_law_with_a_hop(tip12, rule):
     """Against keys of all atoms in NumPy; keys beyond the patch around a hole are those before the event.
@@ -131,6 +132,7 @@ def test_the_next_atom_of_the_law_with_a_hop(tip12, rule):
     assert not np.array_equal(sequence(plain), sequence(ae.evaporation.Emitter(tip12, law=emitter.law, rule=rule)))
 
 
+@pytest.mark.slow
 def test_a_hop_does_not_depend_on_threads_and_batches(nickel):
     size, law = 30 * nickel.a, ae.Extremal(hop=Migration.of("Ni"))
     tip = ae.Tip(nickel, size, axis=(1, 1, 1), shank_length=size, depth=6 * nickel.a, offset_seed=1)

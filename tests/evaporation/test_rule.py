@@ -133,6 +133,7 @@ def potentials_of(emitter):
     return COULOMB * (matrix @ charges)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", CONSTANT, ids=NAMES)
 def test_potentials_are_kept_during_the_events(small_tip, rule):
     settings = ae.evaporation.ChargeSettings(opening_angle=0.2, update_radius=40.0)  # the whole specimen

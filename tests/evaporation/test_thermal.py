@@ -242,6 +242,7 @@ def test_atoms_are_drawn_from_the_rates_of_all_atoms(tip12, rng):
     assert stats.kstest(parts, "uniform").pvalue > CHANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [1_000_000, 20])
 def test_waits_are_exponential(tip12, memory):
     """The rate times the wait is an Exp(1) number; with a short memory the rate rises exponentially while waiting."""
@@ -570,6 +571,7 @@ def run(n_ions, path=None, **options):
     return simulation(**options).run(n_ions, responses=False, progress=False, batch_size=25, checkpoint=checkpoint)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_resumed_between_two_relaxations_has_the_same_bits(tmp_path):
     whole = run(130)
     for n_ions in (30, 65, 100, 130):  # relaxations at 40, 80 and 120

@@ -47,6 +47,7 @@ def test_a_boundary_exposes_nothing_deep():
     assert depth_of_surface(ae.evaporation.Emitter(grains(), n_threads=1)) < 3 * D
 
 
+@pytest.mark.slow
 def test_the_wall_of_a_closed_void_is_no_surface_until_it_opens():
     tip = with_void()
     emitter = ae.evaporation.Emitter(tip, n_threads=1)
@@ -104,6 +105,7 @@ def check_hold(tip, n_events, step):
     return emitter
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [grains, precipitate, with_void], ids=lambda make: make.__name__)
 def test_nothing_floats(make):
     check_hold(make(), 1200, 150)

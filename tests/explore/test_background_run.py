@@ -34,6 +34,7 @@ def settings(folder, ions):
     return folder / "tip.toml"
 
 
+@pytest.mark.slow
 def test_the_run_is_that_of_the_settings(tmp_path):
     path = settings(tmp_path, 300)
     run = ended(BackgroundRun(path, tmp_path / "tip.h5"))
@@ -52,6 +53,7 @@ def test_the_run_is_that_of_the_settings(tmp_path):
     assert len(ae.load(tmp_path / "tip.h5")) == 300
 
 
+@pytest.mark.slow
 def test_a_stopped_run_is_continued(tmp_path):
     path = settings(tmp_path, 3_000)
     run = BackgroundRun(path, tmp_path / "tip.h5")
@@ -77,6 +79,7 @@ def test_bad_settings_are_said(tmp_path):
     assert not run.finished and "Xx" in run.message and run.seconds_left is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["building", "running"])
 def test_a_run_is_stopped_at_any_moment(tmp_path, moment):
     run = BackgroundRun(settings(tmp_path, 200_000), tmp_path / "tip.h5")

@@ -86,6 +86,7 @@ def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units
     assert plain.ceiling.value == ae.maps.similarity_ceiling(like, smoothing=2.0).value
 
 
+@pytest.mark.slow
 def test_a_flown_perturbation_has_the_bits_of_its_flights(small_tip):
     flown = ae.RollUp(ENERGY)
     run = ae.Simulation(small_tip, seed=3, **ROUGH).run(1200, [flown], progress=False)
@@ -156,6 +157,7 @@ def executed(python, **names):
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ions", [None, (300, 1900)])
 @pytest.mark.parametrize("with_map", [False, True])
 def test_python_lines_give_the_same_maps(run, measured, with_map, ions, tmp_path, monkeypatch, capsys):
@@ -251,6 +253,7 @@ def test_profiles_across_a_line(explorer):
         explorer.profiles(maps, [[1.0, 1.0], [1.0, 1.0]], 3.0)
 
 
+@pytest.mark.slow
 def test_rings_about_the_pole(run20):
     """[111] has three-fold symmetry; the ring statistic is that of the library, in the frame of the measured map."""
     run = replace(run20, perturbations=(), flown=())  # its responses alone

@@ -115,6 +115,7 @@ def test_a_slider_moves_the_map_as_the_core_computes_it(opened):
     assert "RollUp:0.33,0.33" in page.code.shell.text
 
 
+@pytest.mark.slow
 def test_every_widget_moves_something(opened):
     page = opened.page
     page.emission.mechanism.active = 3  # combined, which has all sliders but one
@@ -396,6 +397,7 @@ def test_a_number_is_typed(opened):
     assert callback.args["slider"] is opened.page.emission.sliders["mean"]
 
 
+@pytest.mark.slow
 def test_the_registration_arrives(run, measured, monkeypatch):
     """A search in the background shows its progress, and its result; another registration ends it."""
     opened = Opened(Explorer(run, measured, preview=500))
@@ -443,6 +445,7 @@ def test_the_registration_arrives(run, measured, monkeypatch):
     page.close()
 
 
+@pytest.mark.slow
 def test_poles_are_clicked(measured):
     opened = Opened(Explorer(None, measured))
     page, index = opened.page, opened.page.index
@@ -512,6 +515,7 @@ def test_a_search_keeps_the_families_of_marked_poles(measured, monkeypatch):
     opened.page.close()
 
 
+@pytest.mark.slow
 def test_the_orientation_is_searched():
     """The search is that of the library, in another process; its settings can be copied."""
     pattern = ae.maps.master_patterns("fcc")[0]
@@ -551,6 +555,7 @@ def test_the_orientation_is_searched():
     opened.page.close()
 
 
+@pytest.mark.slow
 def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     """From poles that are clicked to a run that opens; no file is replaced without a second click."""
     monkeypatch.chdir(tmp_path)

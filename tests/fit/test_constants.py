@@ -36,6 +36,7 @@ def ions_of(detector_map, angle, factor, n=30_000, first=30.0):
     return ae.Hits(x=x[order], y=y[order], voltage=factor * FIELD * radii), radii
 
 
+@pytest.mark.slow
 def test_constants_are_those_that_the_measurement_was_made_with(measured):
     detector_map, best = measured
     hits, radii = ions_of(detector_map, angle=5.0, factor=3.0)

@@ -33,6 +33,7 @@ def fit(runs):
     return fit_tips(candidates, measured, registration=HERE, bins=32, resamples=40, **GRID)
 
 
+@pytest.mark.slow
 def test_the_tip_and_its_energies_are_found(fit):
     assert fit.best == "right" and fit.order == ["right", "axis"]
     assert fit.studies["right"].optimum.mean == 0.155
@@ -47,6 +48,7 @@ def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(fit):
     assert first.settings == second.settings
 
 
+@pytest.mark.slow
 def test_options_of_the_perturbation_are_axes_of_every_study(runs):
     candidates = {name: runs[name] for name in ("axis", "right")}
     fit = fit_tips(

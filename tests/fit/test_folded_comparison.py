@@ -68,6 +68,7 @@ def test_the_concordance_of_known_contrasts():
     assert concordance(map_of(0.0), measured) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_noise_of_the_measured_ions_is_corrected(rng):
     """The mean of 20 measurements of 20,000 ions is 1 within its error, without the correction less than 0.9."""
     truth = map_of(0.5)

@@ -67,6 +67,7 @@ def window(run):
     return run.hits(ae.RollUp(ENERGY, probability=0.5)).map(200, **extent)
 
 
+@pytest.mark.slow
 def test_runs_and_a_map(family):
     measured = family[2]
     projection = ae.analysis.image_compression(measured).projection

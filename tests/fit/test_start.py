@@ -25,6 +25,7 @@ def found():
     return truth, ae.index(measured, "Ni", scales=(54, 66), patterns=[pattern])
 
 
+@pytest.mark.slow
 def test_the_settings_are_those_of_the_map(found, tmp_path):
     truth, indexing = found
     start = ae.fit.settings_of(indexing, minutes=5)
@@ -110,6 +111,7 @@ def test_bad_arguments_are_named(found):
         ae.fit.settings_of("w.toml")
 
 
+@pytest.mark.slow
 def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
     _, indexing = found
     monkeypatch.chdir(tmp_path)

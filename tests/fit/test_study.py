@@ -176,6 +176,7 @@ def test_options_are_axes():
         EnergyGrid("roll-up", options={"mean": (0.5,)})
 
 
+@pytest.mark.slow
 def test_a_hidden_fraction_is_found(run, other):
     """A map of which 0.6 of the ions roll: the fraction is found, and its interval ends at 1 at the latest."""
     hidden = PartlyRolled(ae.TruncatedNormal(0.155, 0.155), 0.6)
@@ -286,6 +287,7 @@ def test_a_misfit_that_is_0_by_accident_is_not_certain():
 # ---- rings ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rings_of_a_study(twin):
     """The misfit excludes the map with other lines, and does not exclude the hidden energies."""
     study, _, truth = twin
@@ -388,6 +390,7 @@ def test_flattening_takes_gradients_away():
     assert a.flattened(0) is a
 
 
+@pytest.mark.slow
 def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
     """The error told from one measured map, against the scatter of 200 that are truly independent."""
     random = np.random.default_rng(4)
@@ -440,6 +443,7 @@ def test_replicas_have_less_noise(run, other):
     assert alike[1] > alike[0] + 0.1
 
 
+@pytest.mark.slow
 def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
     """What is added to the numerator is the variance that noise adds to windows: of measured counts and of draws."""
     measured, draws = seen(other, ROLLUP), 6
@@ -672,6 +676,7 @@ def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
     assert above[1] == pytest.approx(above[0], rel=1e-9) and above[0].max() > 0
 
 
+@pytest.mark.slow
 def test_a_run_behind_a_lens_gives_the_same_energies(run):
     """The measured map is made through the lens, too; energies at the crystal do not change."""
     real = run.at_evaporation_field(ae.detection.LocalElectrode.preset("local electrode"))
@@ -703,6 +708,7 @@ def test_study_settings_are_checked():
         FitSettings().seed = 3
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_threads(run, other):
     measured = seen(other, ROLLUP)
     options = {
@@ -717,6 +723,7 @@ def test_results_do_not_depend_on_threads(run, other):
     assert one.to_dict() == two.to_dict()
 
 
+@pytest.mark.slow
 def test_densities_have_no_noise_of_their_own(run, other):
     counts = seen(other, ROLLUP)
     densities = ae.DetectorMap.from_array(counts.values / 3.7, EDGES, EDGES, counts.mask)
@@ -758,6 +765,7 @@ def test_bins_of_a_map_are_merged(run, other):
     assert study.measured.bin_size == (5.0, 5.0)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
     """A measured map that is three times as bright on one side as on the other."""
     measured = measured_map(other, ROLLUP)
@@ -788,6 +796,7 @@ def test_studies_that_cannot_be(run, other):
         fit_energies(run, small, registration=HERE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("twin", ["roll-up"], indirect=True)
 def test_pictures(twin, tmp_path):
     study, _, _ = twin

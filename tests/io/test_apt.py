@@ -195,6 +195,7 @@ def test_counts_that_contradict_the_header(save):
         read(save(apt_section("Mass", THREE, "Da", length=-1)))
 
 
+@pytest.mark.slow
 def test_a_file_cut_anywhere_says_so_and_partial_reads_the_whole_sections(tmp_path):
     data, columns = usual_apt()
     names = ["time_of_flight", "mass_to_charge", "x", "y", "multiplicity", "positions"]

@@ -274,6 +274,7 @@ for case in range(120):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run.h5", "ions.nxs", "instrument.h5", "calibrated.h5"])
 def test_damaged_hdf5_is_read_or_refused(tmp_path, small_tip, name):
     """In a process of its own: HDF5 might take it down."""

@@ -341,6 +341,7 @@ def test_compressed_files_of_ase_and_other_compressions(tmp_path):
             ae.read_tip(tmp_path / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compress", [gzip.compress, bz2.compress, lzma.compress])
 def test_a_small_file_cannot_fill_the_memory(tmp_path, compress):
     head = lammps_dump(PLACES, TYPES).encode()

@@ -116,6 +116,7 @@ def test_terms():
         Distortion(2, (0, 0), 1.0, (1.0,))
 
 
+@pytest.mark.slow
 def test_a_distortion_is_found_from_maps(run20):
     """Ions of one half of a run, distorted by 0.5 mm (RMS) against the other half."""
     hits = run20.hits(ae.Unperturbed())

@@ -72,6 +72,7 @@ def test_the_orientation_of_a_map_is_found(structure, axis, rotation, rolled):
     assert 0 < best.angle_error < 0.5 and best.score > 0.7  # the pattern is smoothed, its own noise is in the map
 
 
+@pytest.mark.slow
 def test_a_rotated_map_has_a_rotated_orientation():
     """Rotation of the map by 90 degrees, to the noise of equal counts: nothing depends on x and y."""
     _, map = made("fcc", (0.2, 0.5, 0.84), 10.0)
@@ -90,6 +91,7 @@ def test_a_rotated_map_has_a_rotated_orientation():
     assert misorientation(second.orientation.matrix, expected, proper("fcc")) < 0.1
 
 
+@pytest.mark.slow
 def test_a_compressed_and_shifted_map_is_found():
     projection = ae.detection.Projection(SCALE, (2.0, -1.0), compression=1.5)
     orientation, map = made("bcc", (0.1, 0.3, 0.95), 30.0, projection=projection, ions=60_000)
@@ -98,6 +100,7 @@ def test_a_compressed_and_shifted_map_is_found():
     assert off(found.best, orientation, projection) < 1.0
 
 
+@pytest.mark.slow
 def test_maps_without_structure_and_of_another_crystal_are_undecided():
     _, map = made("bcc", (0.1, 0.60, 0.80), 110.0, rolled=0.0)
     assert not quickly(map, "Ti").decided
@@ -110,6 +113,7 @@ def test_maps_without_structure_and_of_another_crystal_are_undecided():
     assert "undecided" in str(found) and found.to_dict()["verdict"] == "undecided"
 
 
+@pytest.mark.slow
 def test_marks_decide_what_a_noisy_map_does_not():
     orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=1_500, rolled=0.0)
     alone = quickly(map, "Ni")
@@ -125,6 +129,7 @@ def test_marks_decide_what_a_noisy_map_does_not():
     assert off(pointed.best, orientation) < 1.5
 
 
+@pytest.mark.slow
 def test_lines_decide_without_a_pole():
     """Two zone lines of tungsten that are parallel to their zones, and miss the pole in which these meet."""
     orientation, map = made("bcc", (0.02, 0.69, 0.72), 40.0, ions=1_500, rolled=0.0)
@@ -214,6 +219,7 @@ def test_a_given_orientation_is_refined(mirror):
     assert len(found.candidates) == 1
 
 
+@pytest.mark.slow
 def test_densities_are_indexed_as_counts_are():
     orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=60_000)
     density = ae.DetectorMap.from_array(np.where(map.mask, map.density, np.nan), map.x_edges, map.y_edges)
@@ -235,6 +241,7 @@ def test_marks_of_a_wrong_form_are_refused():
         ae.index(map, "Ni", patterns=master_patterns("bcc"))
 
 
+@pytest.mark.slow
 def test_few_ions_do_not_decide(monkeypatch):
     _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=20_000)
     assert quickly(map, "Ni").decided and map.ions > LEAST_IONS
@@ -243,6 +250,7 @@ def test_few_ions_do_not_decide(monkeypatch):
     assert not found.decided and f"{map.ions:,}" in found.reason
 
 
+@pytest.mark.slow
 def test_the_picture_of_an_answer_shows_its_candidates():
     _, map = made("fcc", (0.30, 0.54, 0.79), ions=20_000)
     found = quickly(map, "Ni")
@@ -257,6 +265,7 @@ def test_the_picture_of_an_answer_shows_its_candidates():
     assert DECIDED > 0
 
 
+@pytest.mark.slow
 def test_bounds_of_the_scale_hold_for_all_candidates():
     _, map = made("fcc", (0.30, 0.54, 0.79), 20.0)  # its scale is outside of all of these
     for scales in ((48.0, 54.0), (66.0, 72.0), (50.0, 50.0)):
@@ -276,6 +285,7 @@ def test_half_angles_that_no_instrument_has_are_refused(options):
         ae.index(map, "Ni", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", [0.5, 3.0])
 @pytest.mark.parametrize("shape", ["flat", "gradient", "half"])
 def test_noise_has_no_score(mean, shape):
@@ -322,6 +332,7 @@ def test_marks_outside_the_map_and_of_no_pole_are_refused():
         quickly(map, "Ni", lines=[(0.0, 0.0, 0.0, 90.0)])
 
 
+@pytest.mark.slow
 def test_marks_that_contradict_each_other_or_the_map_are_named():
     orientation, map = made("fcc", (0.42, 0.50, 0.76), 20.0)
     projection = ae.detection.Projection(SCALE)
@@ -338,6 +349,7 @@ def test_marks_that_contradict_each_other_or_the_map_are_named():
     assert not near.decided and "contradict each other" in near.reason and near.reason.count("called 111") == 2
 
 
+@pytest.mark.slow
 def test_marks_that_would_decide_are_named():
     """The named spot is a pole of its candidate, of a family that no other candidate has there."""
     _, map = made("fcc", (0.30, 0.54, 0.79), 20.0, ions=30_000, rolled=0.5)

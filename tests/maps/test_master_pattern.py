@@ -57,6 +57,7 @@ def test_large_tips_have_narrow_poles():
     assert 0.35 < edges[1] / edges[0] < 0.75
 
 
+@pytest.mark.slow
 def test_a_pattern_is_the_direct_sum_over_the_point_group(run):
     pattern = ae.analysis.master_pattern(run)
     assert pattern.structure == "fcc" and pattern.apex_radius == 9 and pattern.ions == 3_000

@@ -108,6 +108,7 @@ def test_an_orientation_goes_straight_into_a_tip():
     assert np.linalg.norm(tip.positions - tip.positions[origin] - step, axis=1).min() < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PLANES)
 @pytest.mark.parametrize("mirror", [False, True])
 @given(seed=seeds)

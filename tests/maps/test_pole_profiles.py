@@ -43,6 +43,7 @@ def test_width_and_height_of_a_line(rng, height):
     assert 0 < line.width_error < 0.2
 
 
+@pytest.mark.slow
 def test_errors_of_a_line_are_those_of_new_maps(rng):
     lines = [
         ae.maps.fit_zone_line(ae.maps.pole_line_profile(map_of(rng, 60_000), PLANE, POLE, TOWARD)) for _ in range(30)
@@ -69,6 +70,7 @@ def test_lines_of_densities_have_errors_by_their_noise(rng):
     assert np.isnan(none.error).all()
 
 
+@pytest.mark.slow
 def test_a_dark_pole_with_errors(rng):
     """Radial densities with Poisson errors: 30 maps scatter by them."""
     radii = (0.0, 2.0, 4.0, 8.0)

@@ -111,6 +111,7 @@ def test_a_known_transform(map_of, simulated, scale, mirror, radius, shift, seed
     assert found.score > 0.75 and found.overlap > 0.98
 
 
+@pytest.mark.slow
 def test_layers_of_their_own(low):
     """The maps share no atom: 8,000 of the early layers, 8,000 of the late ones, when the tip is blunter by 2 %."""
     early = together(*(replace(low, seed=seed).hits(ROLLED)[:8000] for seed in range(1, 7)))
@@ -121,6 +122,7 @@ def test_layers_of_their_own(low):
     assert found.mirror and rotation < 1 and stretch < 0.03 and distance < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_what_is_known_is_kept(map_of, simulated):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True)
@@ -146,6 +148,7 @@ def test_what_is_known_is_kept(map_of, simulated):
     assert not plain.mirror and plain.score < found.score - 0.1
 
 
+@pytest.mark.slow
 def test_the_score_surface_has_its_maximum_at_the_registration(map_of, simulated):
     map = map_of(ae.Registration(17.0, 0.45, (8.0, 3.0)), 30, 2)
     surface = ae.maps.score_surface(simulated, map, scales=(0.36, 0.55), rotations=(-30.0, 80.0))
@@ -178,6 +181,7 @@ def test_a_threefold_pole_with_mirrors_has_ties(tip20):
     assert abs(second.rotation - 137) < 1  # a start chooses
 
 
+@pytest.mark.slow
 def test_maps_that_have_nothing_in_common(simulated):
     rng = np.random.default_rng(5)
     z = 20 * np.sqrt(rng.random(100_000)) * np.exp(2j * np.pi * rng.random(100_000))
@@ -188,6 +192,7 @@ def test_maps_that_have_nothing_in_common(simulated):
         register(simulated, ae.Hits(x=z.real, y=z.imag), scales=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not NICKEL.exists(), reason="the measured map of nickel is not there")
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_measured_nickel(run20):
@@ -350,6 +355,7 @@ def test_masked_correlation_against_sums(rng):
 # ---- picture -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_overlay(low, simulated, tmp_path):
     true = ae.Registration(17.0, 0.45, (8.0, 3.0), True, score=0.9, overlap=1.0)
     map = measured(draws(low, FASTER, 2), true, 30, 2, ions=30_000)

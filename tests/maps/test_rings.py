@@ -63,6 +63,7 @@ def test_noise_is_no_contrast(rng):
     assert np.mean(np.square(found)) < 0.5 / n  # half of the squared noise, as negative variances count as 0
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_new_counts(rng):
     rings = [
         ae.maps.ring_statistics(counted(simulated(rng, 40_000, 0.5)), PLANE, POLE, [(9, 20)], fold=3)[0]
@@ -89,6 +90,7 @@ def test_densities_have_the_noise_of_their_hits(rng):
     assert two.ions == pytest.approx(one.ions, rel=0.05)
 
 
+@pytest.mark.slow
 def test_errors_of_a_profile_are_those_of_new_counts(rng):
     """40 maps: the scatter of each of 24 values, and of the extremes about their mean."""
     rings = [

@@ -33,6 +33,7 @@ def test_a_line_that_misses_the_centre_is_found(direction, distance, height):
     assert np.hypot(x1 - x0, y1 - y0) == pytest.approx(30.0)
 
 
+@pytest.mark.slow
 def test_the_errors_are_those_of_repeated_measurements(rng):
     expected = 8.0 * density(4.0, 3.0)
     found, errors = [], []

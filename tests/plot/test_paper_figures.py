@@ -17,6 +17,7 @@ def maps():
     return [ae.DetectorMap.from_array(rng.poisson(9, (64, 64)), EDGES, EDGES, is_counts=True) for _ in range(3)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number, width", [(1, 85.0), (2, 85.0), (3, 85.0), (3, 170.0)])
 def test_a_figure_has_its_width_and_no_titles(maps, number, width, tmp_path):
     axes = ae.plot.paper_maps(maps[:number], width)

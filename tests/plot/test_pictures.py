@@ -96,6 +96,7 @@ def text_with(ax, words):
     return text
 
 
+@pytest.mark.slow
 def test_a_later_title_is_above_the_caption(ratios, rough_layout):
     map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
@@ -121,6 +122,7 @@ def test_lines_of_an_overlay_are_those_of_its_legend():
         assert np.mean(legend.get_frame().get_facecolor()[:3]) < 0.5  # one line is white
 
 
+@pytest.mark.slow
 def test_titles_are_names_of_files(run, emitter):
     """Dollar signs are no formula, and a byte that is not text is a mark of its own."""
     map = ae.DetectorMap.from_array(np.random.default_rng(0).random((40, 40)), np.arange(41.0), np.arange(41.0))
@@ -463,6 +465,7 @@ def ratios():
     return first, charge_state_ratio_map(charged(20_000, 0.01, 2), "Ni", 1, like=first)
 
 
+@pytest.mark.slow
 def test_charge_states_side_by_side(ratios, tmp_path):
     for quantity, label in (("ratio", ""), ("field", "field from ")):
         axes = plot.charge_states(*ratios, quantity=quantity)

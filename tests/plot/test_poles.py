@@ -16,6 +16,7 @@ def places(ax):
     return np.asarray(ax.collections[0].get_offsets())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "axis"), [("Ni", (1, 1, 1)), ("W", (0, 1, 1)), ("Si", (0, 0, 1)), ("Ti", (0, 0, 0, 1))]
 )
@@ -47,6 +48,7 @@ def test_only_what_is_inside_the_detector_is_drawn(drawn):
         assert not (np.hypot(*line.get_xydata().T) > 12.6).any()
 
 
+@pytest.mark.slow
 def test_parts_can_be_left_out_and_names_do_not_overlap(drawn):
     _, ax = drawn
     orientation, projection = ae.Orientation("Ni", (1, 1, 1)), ae.detection.Projection(12.0)

@@ -48,6 +48,7 @@ def pictures(seen):
         yield imread(io.BytesIO(data)), (int(image["height"]), int(image["width"]))
 
 
+@pytest.mark.slow
 def test_nothing_is_loaded(seen):
     assert len(seen.addresses) >= 4
     assert all(each.startswith(("data:", "#")) for each in seen.addresses)
@@ -55,6 +56,7 @@ def test_nothing_is_loaded(seen):
     assert policy.startswith("default-src 'none'; img-src data:;") and "http" not in policy
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
 def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
     settings = {**ROUGH, "response_settings": ae.ResponseSettings.wide(bound=5.0)}
@@ -137,6 +139,7 @@ def test_pictures_are_drawn_and_their_size_is_stated(page, seen):
     assert 0.5 < stated * 1e6 / page.stat().st_size < 1
 
 
+@pytest.mark.slow
 def test_only_the_given_figures(study, tmp_path):
     ae.plot.write_study(study, tmp_path / "r.html", figures={"a < b": Figure((1, 1))})
     seen = Reader((tmp_path / "r.html").read_text())
@@ -149,6 +152,7 @@ def doubtful(study):
     return replace(study, registration=replace(study.registration, score=0.2, overlap=0.8, method="search"))
 
 
+@pytest.mark.slow
 def test_maps_that_are_not_alike_have_no_numbers(study, tmp_path):
     """Neither energies nor scores, also in what is folded; the page says why."""
     for unsure in (doubtful(study), replace(study)):
@@ -191,6 +195,7 @@ def test_without_resamples_and_correction(study, tmp_path):
     assert "nan" not in re.findall(r"\w+", text.lower()) and "uncorrected" not in text and "best in" not in text
 
 
+@pytest.mark.slow
 def test_hostile_names_are_text(study, tmp_path):
     """A file name may be anything; it must neither end a script nor become an element."""
     name = "</script><img src=http:x onerror=alert(1)>&\udc80$title"

@@ -92,6 +92,7 @@ def test_only_as_many_pictures_as_asked_for(study, tmp_path):
     assert Reader((tmp_path / "s.html").read_text()).all("img") == []
 
 
+@pytest.mark.slow
 def test_maps_without_a_comparison_are_shown_for_every_emission(study, tmp_path, monkeypatch):
     points = [
         SweepRow(name, {"seed": seed}, panels={"unperturbed": study.measured, "rolled": study.measured})

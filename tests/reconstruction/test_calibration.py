@@ -33,6 +33,7 @@ def aluminium():
     return sites[detected], hits[detected]
 
 
+@pytest.mark.slow
 def test_the_spacing_of_planes(aluminium):
     sites, hits = aluminium
     known = {"atomic_volume": A**3 / 4, "distance": DISTANCE, "compression": XI, "detector_radius": RIM}
@@ -71,6 +72,7 @@ def test_planes_along_a_direction(aluminium, axis, planes):
     assert found.references < len(sites) and found.counts.sum() >= 300_000
 
 
+@pytest.mark.slow
 def test_the_depth_resolution(aluminium, rng):
     sites, _ = aluminium
     for deviation in (0.02, 0.05):

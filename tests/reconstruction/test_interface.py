@@ -32,6 +32,7 @@ def test_the_width_of_a_step(sigma, before, after):
     assert np.abs(z).max() < 4
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_repeated_measurements():
     def once(seed):
         return ae.reconstruction.interface_profile(*ions(lambda d: 0.1 + 0.8 * ndtr(d / 0.3), seed), reach=1.5)

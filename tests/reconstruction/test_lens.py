@@ -42,6 +42,7 @@ def receding(lens):
     return hits, sites, number[-1] / n
 
 
+@pytest.mark.slow
 def test_a_shank_whose_radius_doubles_comes_back(lens, receding):
     """With the lens the places are exact and the depth is that of the volume; constants of either end are not."""
     hits, sites, share = receding
@@ -64,6 +65,7 @@ def test_a_shank_whose_radius_doubles_comes_back(lens, receding):
     assert max(np.abs(errors)) > 0.05
 
 
+@pytest.mark.slow
 def test_the_free_constants_are_fitted_with_a_lens(lens, receding):
     hits, sites, share = receding
     known = {"atomic_volume": VOLUME * share, "efficiency": EFFICIENCY, "distance": LENGTH, "detector_radius": RIM}
@@ -140,6 +142,7 @@ def test_the_shank_angle_follows_from_the_voltages(lens, receding):
     assert abs(fit.per_cent["evaporation field"]) > 0.02
 
 
+@pytest.mark.slow
 def test_voltages_without_a_shank_are_refused(lens, receding):
     hits, _, share = receding
     known = {"atomic_volume": VOLUME * share, "efficiency": EFFICIENCY, "distance": LENGTH, "detector_radius": RIM}

@@ -110,6 +110,7 @@ def reconstructed(run, nickel, origins=None):
     return ae.reconstruct(hits, **known, projection="compressed", compression=compression, origins=origins)
 
 
+@pytest.mark.slow
 def test_the_errors_of_a_twin_run(twins, nickel):
     first, second = twins
     plain = reconstructed(second, nickel).errors(second)

@@ -376,6 +376,7 @@ def test_other_settings_are_refused(unfinished):
     assert len(interrupted(unfinished, (), resume=True)) == 90
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("there", "message"),
     [
@@ -507,6 +508,7 @@ def test_a_run_that_is_overwritten_keeps_its_mode(tmp_path):
 # ---- what does not belong together ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -540,6 +542,7 @@ def test_a_run_knows_all_systems_it_was_computed_on(tmp_path):
 # ---- damaged files -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [0.001, 0.5])
 def test_a_damaged_checkpoint_is_named(unfinished, place):
     path = Path(f"{unfinished}.unfinished")

@@ -65,6 +65,7 @@ def polar_angles(hits):
 # ---- ions that can arrive --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["nickel", "alloy"])
@@ -119,6 +120,7 @@ def test_the_prediction_is_needed(tips, wide_all, monkeypatch):
     assert np.count_nonzero(inside & part.not_flown) > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("energy_limit", [0.3, 4.0])
 def test_the_margin_follows_the_energy_limit(tips, energy_limit):
     settings = ae.ResponseSettings.wide(energy_limit=energy_limit)
@@ -207,6 +209,7 @@ def test_real_units_keep_the_field_of_view(wide_all, wide_part):
 # ---- detectors -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("projection", ["plane", "equidistant"])
 def test_the_detector_is_a_field_of_view(tips, projection):
     detector = ae.Detector(distance=100.0, width=60.0, projection=projection)
@@ -250,6 +253,7 @@ def test_a_detector_that_sees_more_is_warned_about(wide_part):
     assert len(recorded) and np.isfinite(recorded.x).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_a_detector_behind_a_lens(tips):
     lens = ae.detection.LocalElectrode.preset("local electrode")

@@ -66,6 +66,7 @@ def test_a_run_knows_the_phase_of_every_ion_through_a_file(mixed, tmp_path):
     assert ae.Orientation.from_settings(loaded.settings["tip"]).material == AL
 
 
+@pytest.mark.slow
 def test_a_resumed_run_has_the_same_bits(mixed, tmp_path):
     whole = run_of(mixed, 700)
     checkpoint = ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True)

@@ -203,6 +203,7 @@ def test_an_epos_has_what_an_instrument_could_have_written(run, tmp_path):
     assert np.array_equal(read.pulses, hits.pulses) and np.array_equal(read.multiplicity, hits.multiplicity)
 
 
+@pytest.mark.slow
 def test_a_run_in_real_units_is_resumed_as_simulated(tip12, tmp_path):
     path = tmp_path / "run.h5"
     short = ae.Simulation(tip12, seed=3, n_threads=1).run(150, progress=False, checkpoint=path)

@@ -56,6 +56,7 @@ def test_the_field_factor_grows_with_the_shank():
     assert free(7.0, math.radians(1.5), 35.0, rounded=False).field_factor == pytest.approx(factors[-1], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_free_specimen_has_the_field_factor_of_the_atoms(large_run, lens):
     """V / (F R) of the run, with the mean field and the radius of its cap."""
     factors = large_run.voltage / (large_run.cap.fields * large_run.cap.radii)
@@ -67,6 +68,7 @@ def test_the_free_specimen_has_the_field_factor_of_the_atoms(large_run, lens):
 # ---- voltages --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_voltages_of_the_instrument_give_the_radius(real, lens):
     """V = k_f(R) F R in the mean."""
     radii = real.lens.radii(real.emissions.ions)
@@ -84,6 +86,7 @@ def test_energies_are_those_of_the_run_without_a_lens(run, real):
     assert np.array_equal(real.voltages, plain.voltages)
 
 
+@pytest.mark.slow
 def test_a_lens_and_a_field_factor_exclude_each_other(run, lens):
     with pytest.raises(ValueError, match="field_factor"):
         run.at_evaporation_field(lens, field_factor=3.0)
@@ -119,6 +122,7 @@ def test_places_and_times_are_those_of_the_lens(run, real, lens):
         assert hits.time_of_flight[ion] != pytest.approx(time, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_ions_that_the_electrode_stops_miss_the_detector(run, lens):
     narrow = LocalElectrode(40e3, 6e3, 5.0)
     wide = ae.Detector(90.0, 1e5)
@@ -149,6 +153,7 @@ def large_run(nickel):
     return ae.Simulation(tip, seed=1, n_threads=1).run(4000, [ae.Unperturbed()], responses=False, progress=False)
 
 
+@pytest.mark.slow
 def test_a_lens_that_is_the_free_specimen_changes_nothing(run):
     """The same coefficients forwards and backwards."""
     rows = np.array(run.on_detector(DETECTOR, LocalElectrode(40e3, 20e3, 5.0)).lens.stages)
@@ -173,6 +178,7 @@ def test_a_lens_that_is_the_free_specimen_changes_nothing(run):
     assert seen == pytest.approx(directions, rel=1e-9) and at == pytest.approx(times, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_potential_of_the_detector_needs_voltages(run, lens):
     drawn = replace(lens, detector_potential=100.0)
     with pytest.raises(ValueError, match="detector_potential"):
@@ -211,6 +217,7 @@ def test_an_instrument_records_what_the_lens_shows(real):
     assert recorded.x == pytest.approx(hits.x[inside], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_another_lens_for_a_run_in_real_units_is_refused(real, lens):
     assert real.on_detector(DETECTOR, lens).lens == real.lens
     with pytest.raises(ValueError, match="lens"):

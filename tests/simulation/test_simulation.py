@@ -374,6 +374,7 @@ def test_evaporation_past_the_point_of_the_potential(nickel):
     assert deep == pytest.approx(1000.0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_settings_do_not_depend_on_threads_when_a_shell_deepens(nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, axis=(1, 1, 1), depth=3.5 * nickel.a)
     settings, sites = [], []

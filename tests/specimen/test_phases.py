@@ -106,6 +106,7 @@ def test_numbers_of_the_sites_are_uniform_and_independent():
         assert abs(np.corrcoef(one.ravel(), two.ravel())[0, 1]) < 5 / np.sqrt(one.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [None, 2.0])
 def test_fractions_of_solutes_and_vacancies(depth):
     matrix = ae.specimen.Phase("matrix", AL, solutes={"Cu": 0.2, "Si": 0.05}, vacancies=0.1)
@@ -275,6 +276,7 @@ SPECIMENS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SPECIMENS)
 def test_a_deeper_shell_is_the_same_alloy(name):
     make = SPECIMENS[name]

@@ -59,6 +59,7 @@ def test_signed_distance_never_changes_faster_than_the_points(angle, length, bas
     assert (change <= np.linalg.norm(one - other, axis=1) + 1e-12).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("base", ["rounded", "flat"])
 @pytest.mark.parametrize("depth", [None, 0.3, 2.0])
 def test_volume_and_bounds_against_random_points(base, depth):

@@ -58,6 +58,7 @@ def collected(sweep):
     return collect_sweep(sweep)
 
 
+@pytest.mark.slow
 def test_the_maps_are_those_of_the_runs(sweep, collected):
     assert collected["points"] == 5 and collected["done"] == 4 and collected["fit"] is None
     done = [key for key in sweep.keys if key != sweep.keys[1]]

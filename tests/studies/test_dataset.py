@@ -90,6 +90,7 @@ def made(tmp_path_factory):
     return plan, folder / "set"
 
 
+@pytest.mark.slow
 def test_the_ions_are_those_that_the_instrument_records(made):
     plan, folder = made
     data = ae.studies.load_dataset(folder)
@@ -152,6 +153,7 @@ def test_more_samples_do_not_move_the_first_ones(made, tmp_path):
     assert full and full.items() <= {shard.name: shard.key for shard in plan.shards}.items()
 
 
+@pytest.mark.slow
 def test_more_samples_after_an_interruption(made, tmp_path, monkeypatch):
     """Killed when the last file is replaced, but the checksums are those of the smaller set."""
     few = planned(tmp_path)
@@ -183,6 +185,7 @@ def test_runs_of_a_specimen_are_in_one_part(tmp_path):
         assert split_of(one, settings) == split_of(other, settings)
 
 
+@pytest.mark.slow
 def test_the_split_follows_its_fractions(tmp_path):
     plan = planned(tmp_path, STUDY.replace("sample = 4", "sample = 400"), runs=False)
     numbers = [sum(len(shard.points) for shard in plan.shards if shard.split == name) for name in SPLITS]
@@ -191,6 +194,7 @@ def test_the_split_follows_its_fractions(tmp_path):
         assert abs(number - 400 * fraction) < 5 * np.sqrt(400 * fraction * (1 - fraction))
 
 
+@pytest.mark.slow
 def test_poles_are_where_the_ions_around_them_arrive(tmp_path):
     """Ions that start within 10 degrees of a direction arrive around the position of its pole, for both projections."""
     base = BASE.replace("ions = 150", "ions = 3000").replace("6 a", "8 a")
@@ -260,6 +264,7 @@ def test_runs_that_fail_are_named_or_left_out(tmp_path):
     assert make_dataset(plan, tmp_path / "set", without_failed=True) == content
 
 
+@pytest.mark.slow
 def test_tables_and_parts(made):
     data = ae.studies.load_dataset(made[1])
     parts = [data.split(name) for name in SPLITS]
@@ -304,6 +309,7 @@ def test_xarray(made):
     assert dataset["poles_normal"].shape == (len(data.table("poles")["x"]), 3)
 
 
+@pytest.mark.slow
 def test_parquet_has_the_same_content(made, tmp_path):
     pytest.importorskip("pyarrow")
     plan = planned(tmp_path, STUDY.replace("draws", 'format = "parquet"\ndraws'))
@@ -395,6 +401,7 @@ def first(data):
     return data[0].about["name"], data[0].ions["x"].tolist()
 
 
+@pytest.mark.slow
 def test_two_sets_with_one_relative_name_are_two(made, other, tmp_path, monkeypatch):
     loaded = []
     for name, source in (("a", made[1]), ("b", other[1])):
@@ -452,6 +459,7 @@ def check_equal(one, other):
         np.testing.assert_array_equal(values, other[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["hdf5", "parquet"])
 def test_no_flipped_bit_is_read(made, tmp_path, suffix):
     """Of 1,000 there was no other result (measured once); here a few."""
@@ -501,6 +509,7 @@ def mutated(content, random):
     return content
 
 
+@pytest.mark.slow
 def test_changed_descriptions_are_refused_or_change_no_ion(made, tmp_path):
     """Also with right checksums: a description of somebody else leads to no other column, file or traceback."""
     folder, random = replaced(tmp_path / "set", made[1]), np.random.default_rng(1)
@@ -659,6 +668,7 @@ def test_texts_of_a_set_can_change(made, tmp_path):
     assert times == {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
 def test_runs_that_a_disk_has_ended_are_made_again(made, tmp_path, monkeypatch, code):
     plan = planned(tmp_path)
@@ -759,6 +769,7 @@ def finished(process):
     assert process.returncode == 0, errors.decode()
 
 
+@pytest.mark.slow
 def test_two_commands_at_once_make_one_set(made, tmp_path):
     planned(tmp_path, runs=False)
     processes = [started(tmp_path / "study.toml", tmp_path / "set") for _ in range(2)]
@@ -767,6 +778,7 @@ def test_two_commands_at_once_make_one_set(made, tmp_path):
     check_same(made[1], tmp_path / "set")
 
 
+@pytest.mark.slow
 def test_a_killed_set_has_the_same_bytes(made, tmp_path):
     """Killed while the second run evaporates, when the first one is done."""
     planned(tmp_path, runs=False)

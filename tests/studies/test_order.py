@@ -42,6 +42,7 @@ def alloy():
     return ae.Simulation(tip, seed=1, n_threads=1).run(3000, [ae.Unperturbed()], responses=False, progress=False)
 
 
+@pytest.mark.slow
 def test_a_random_alloy_with_equal_fields_has_no_order(alloy):
     order = ae.studies.false_order([alloy], "Al")
     for each in (order.reconstructed, order.true):

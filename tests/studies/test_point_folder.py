@@ -37,6 +37,7 @@ def sweep(tmp_path):
     return planned(tmp_path, TWO, SMALL)
 
 
+@pytest.mark.slow
 def test_a_point_is_the_same_as_apt_evap_run_with_its_settings(sweep):
     one, other = (sweep.folder_of(key) for key in sweep.keys)
     assert sweep.state(one.name).name == "waiting"
@@ -64,6 +65,7 @@ def test_a_point_on_which_a_process_works_is_left_to_it(sweep):
     assert run_point(folder).name == "done"
 
 
+@pytest.mark.slow
 def test_a_run_that_another_program_writes_is_no_failure(sweep):
     """`apt-evap run`, started by Snakemake, locks its run but not the point."""
     folder = sweep.folder_of(sweep.keys[0])

@@ -96,6 +96,7 @@ def refused(capsys, *arguments):
     return line
 
 
+@pytest.mark.slow
 def test_a_folder_belongs_to_one_file_and_one_set_of_options(quick, capsys):
     first = ["ni.epos", *ARGUMENTS, "-o", "t"]
     assert main(["twin", *first]) == 0
@@ -116,6 +117,7 @@ def test_a_folder_belongs_to_one_file_and_one_set_of_options(quick, capsys):
     assert quick == ["run"]  # nothing was computed for them
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["specimen.toml", "start.json", "registration.json", "answer.txt", "study/report.html"]
 )
@@ -154,6 +156,7 @@ def test_a_folder_of_others_stays_as_it_is(quick, capsys, tmp_path):
     assert os.listdir("mine") == ["specimen.toml"]
 
 
+@pytest.mark.slow
 def test_a_name_with_a_dash_is_not_an_option(quick, capsys, tmp_path):
     os.rename("ni.epos", "-ni.epos")
     assert main(["twin", *ARGUMENTS, "--distance", "90", "--", "-ni.epos"]) == 0
@@ -188,6 +191,7 @@ def test_after_every_write_the_command_continues(quick, capsys, tmp_path, monkey
     assert code == 0  # fewer writes than this
 
 
+@pytest.mark.slow
 def test_the_content_of_the_first_step_is_checked(quick, capsys, tmp_path):
     first = ["ni.epos", *ARGUMENTS, "-o", "t"]
     assert main(["twin", *first]) == 0
@@ -228,6 +232,7 @@ def test_the_digest_is_recorded_before_the_file(tmp_path):
         KeptFiles(tmp_path / "t", {"FILE": "2"}, {"scales": [1.0, 2.0]}, ["a"])
 
 
+@pytest.mark.slow
 def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path):
     ions = measurement(tmp_path / "ni.epos", voltages=(2000.0, 4000.0))
     best = ae.index(ions, "Ni", scales=(56, 64), patterns=master_patterns("fcc")[:1]).best
@@ -268,6 +273,7 @@ def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
     assert quick == ["run", "index"]
 
 
+@pytest.mark.slow
 def test_a_folder_belongs_to_its_ions(quick):
     ions = ae.read("ni.epos")
     ae.twin(ions, "Ni", scales=(56, 64), folder="mine")
@@ -300,6 +306,7 @@ def test_what_is_wrong_is_said_before_anything_is_done(quick, small_tip, changed
     assert sentence in str(error.value) and quick == [] and not os.path.exists("t")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verdict, given", [("alike", True), ("not alike", False)])
 def test_constants_of_the_crystal_and_commands_are_given_only_for_its_maps(quick, capsys, monkeypatch, verdict, given):
     monkeypatch.setattr(_Study, "likeness", SimpleNamespace(verdict=verdict))
@@ -312,6 +319,7 @@ def test_constants_of_the_crystal_and_commands_are_given_only_for_its_maps(quick
     assert "report.html" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_radius_has_the_digits_of_its_field_factor(quick):
     assert main(["twin", "ni.epos", "--element", "Ni", "--distance", "90", "-o", "t"]) == 0
     (line,) = [line for line in open("t/answer.txt") if line.startswith("radius at the first ions")]

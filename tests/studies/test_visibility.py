@@ -59,6 +59,7 @@ def pairs(positions, labels):
     return tree.count_neighbors(tree, 0.5)
 
 
+@pytest.mark.slow
 def test_without_errors_the_probability_is_that_of_binomial_numbers(tip, ideal):
     feature, twins, efficiency = particle(0.6, fraction=0.13), 200, 0.6
     ideal = replace(ideal, settings=ideal.settings | {"feature": to_plain(feature)})
@@ -80,6 +81,7 @@ def test_without_errors_the_probability_is_that_of_binomial_numbers(tip, ideal):
     assert answer.probability.value == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / twins))
 
 
+@pytest.mark.slow
 def test_equal_fields_without_energies_leave_binomial_scatter(operators):
     twins, efficiency = 150, 0.5
     each = [operators.emulate(k, efficiency, size=0.8) for k in range(twins)]
@@ -339,6 +341,7 @@ def test_a_thicker_layer_is_seen_thicker(tip):
     assert abs(answer.errors["apparent thickness"].bias) < 0.1  # a third of the distance of the planes, 0.2 nm
 
 
+@pytest.mark.slow
 def test_more_ions_are_found_more_often(tip, operators):
     small = particle(0.6, fraction=0.25)
     weak = replace(operators, settings=operators.settings | {"feature": to_plain(small)})
@@ -364,6 +367,7 @@ def test_the_analysis_can_measure(tip, operators):
     assert answer.true_size(float(np.mean(answer.measured["size"]))).median == pytest.approx(0.8, rel=0.2)
 
 
+@pytest.mark.slow
 def test_features_with_an_order_are_simulated_in_full(tip):
     order = ae.specimen.Superlattice("L1_2", "Al")
     domain = ae.specimen.Phase("domain", "Ni", ae.specimen.Sphere((0, 0, 2.0), 0.5), order=order)

@@ -102,6 +102,7 @@ QUICK = ae.fit.FitSettings(replicas=1, resamples=2)
 HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_comparison_is_that_of_the_command(folder, pair, capsys):
     run, measured = pair
@@ -120,6 +121,7 @@ def test_a_comparison_is_that_of_the_command(folder, pair, capsys):
     assert [described["name"] for described in origin["files"]] == ["run.h5", "map.npz"] and not origin["command"]
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_comparison_of_data_in_memory_writes_nothing_unless_it_is_asked_to(folder, pair):
     run, measured = pair

@@ -85,6 +85,7 @@ def test_two_points_by_two_processes(tmp_path):
     assert content["counts"]["done"] == 2 and all(0 < row["seconds"] < 60 for row in content["table"])
 
 
+@pytest.mark.slow
 def test_a_failed_point_does_not_stop_the_others(tmp_path, capsys):
     sweep = planned(tmp_path, TWO, SMALL)
     bad, good = sweep.keys
@@ -101,6 +102,7 @@ def test_a_failed_point_does_not_stop_the_others(tmp_path, capsys):
     check_done(sweep)
 
 
+@pytest.mark.slow
 def test_an_interrupt_saves_all_ions_and_the_next_call_continues(tmp_path):
     """A batch system sends SIGTERM to all processes."""
     sweep = planned(tmp_path, TWO_LONG, LONG)
@@ -129,6 +131,7 @@ def test_an_interrupt_ends_the_work_at_any_time(tmp_path, moment):
     assert {state.name for _, state in sweep.states()} <= {"waiting", "done"}
 
 
+@pytest.mark.slow
 def test_a_terminal_interrupts_each_run_once(tmp_path):
     """A second interrupt would lose the ions since the last checkpoint."""
     sweep = planned(tmp_path, TWO_LONG, LONG)
@@ -159,6 +162,7 @@ def test_a_killed_process_does_not_stop_the_others(tmp_path):
     check_done(sweep)
 
 
+@pytest.mark.slow
 def test_the_runs_end_with_a_killed_command(tmp_path):
     sweep = planned(tmp_path, TWO_LONG, LONG)
     process = command(sweep, "--workers", "2")
@@ -177,6 +181,7 @@ def test_a_run_whose_command_ended_before_it_began_ends_at_once():
     assert done.returncode == -signal.SIGKILL and done.stdout == ""
 
 
+@pytest.mark.slow
 def test_processes_that_are_always_killed_end_the_command(tmp_path):
     sweep = planned(tmp_path, TWO.replace("[1, 2]", "[1, 2, 3, 4, 5]"), SMALL)
     (tmp_path / "killed").mkdir()
@@ -190,6 +195,7 @@ def test_processes_that_are_always_killed_end_the_command(tmp_path):
     assert {state.name for _, state in sweep.states()} == {"waiting"}
 
 
+@pytest.mark.slow
 def test_two_commands_share_a_sweep(tmp_path):
     sweep = planned(tmp_path, TWO.replace("[1, 2]", "[1, 2, 3, 4]"), SMALL)
     commands = [command(sweep) for _ in range(2)]
@@ -198,6 +204,7 @@ def test_two_commands_share_a_sweep(tmp_path):
     check_done(sweep)
 
 
+@pytest.mark.slow
 def test_work_where_no_locks_are(tmp_path):
     """Some file systems of clusters have no flock."""
     (tmp_path / "no_flock").mkdir()

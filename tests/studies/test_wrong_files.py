@@ -77,6 +77,7 @@ def row_of(sweep, key):
 # ---- runs ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_run_of_another_point_is_not_collected(sweep):
     for one, other in ((1, 0), (2, 0)):
         path = sweep.folder_of(sweep.keys[one]) / "run.h5"
@@ -133,6 +134,7 @@ def test_changed_settings_of_a_point_are_refused(sweep):
     check_done(sweep)
 
 
+@pytest.mark.slow
 def test_a_run_of_unknown_origin_is_not_that_of_a_point(sweep):
     key = sweep.keys[0]
     path = sweep.folder_of(key) / "run.h5"
@@ -144,6 +146,7 @@ def test_a_run_of_unknown_origin_is_not_that_of_a_point(sweep):
     check_done(sweep)
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_early_shows_its_own_number_of_ions(tmp_path):
     write_dump(tmp_path / "tip.dump")
     base = SMALL[SMALL.index("[simulation]") :].replace("ions = 20", "ions = 100_000\nresponses = false")
@@ -155,6 +158,7 @@ def test_a_run_that_ended_early_shows_its_own_number_of_ions(tmp_path):
     assert row["state"] == "done" and row["n_ions"] == 100_000 and row["ions"] == len(run) < 1000
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the limit is lower
 def test_real_units_are_compared(tmp_path):
     base = SMALL + "[real_units]\nflight_charges = 1\n"
@@ -171,6 +175,7 @@ def test_real_units_are_compared(tmp_path):
     assert do(sweep, sweep.keys[0]).units is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bit of the data", "bit of the settings", "cut", "pipe", "folder", "text"])
 def test_one_damaged_run_does_not_stop_the_others(sweep, damage):
     key = sweep.keys[2]
@@ -230,6 +235,7 @@ def test_links_in_the_folder_of_a_point_are_not_followed(sweep, tmp_path):
     assert run_point(sweep.folder_of(key)).name == "done"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["points", "points/KEY"])
 def test_a_folder_that_is_a_link_is_refused(sweep, tmp_path, name):
     (key,) = reopen(sweep, 0)
