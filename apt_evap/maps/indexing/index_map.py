@@ -37,9 +37,7 @@ different results [degrees]."""
 DECIDED = 12.0
 """Margin to the next different orientation above which a map decides, see the notes of `index`."""
 RIVAL = 0.8
-"""Largest score of another orientation, relative to that of the first one, with which a map decides."""
-SCALE_RIVAL = 0.9
-"""The same for another scale of the first orientation, which shares the pole at its centre."""
+"""Largest score of another orientation or scale, relative to that of the first one, with which a map decides."""
 LEAST_SCORE = 1 / 3
 """Smallest score with which a map decides, without marks: a measured nickel map reaches 0.28 for a wrong orientation
 with a margin of 26, a measured tungsten map 0.40 for the right one. Chosen with these two maps."""
@@ -284,8 +282,8 @@ def index(
 
     The map is `decided` if the margin to the next result is above 12: another orientation, by more than 6 degrees, or
     the same one at a scale that changes the half angle of the field of view by more than 6 degrees. Without marks of a
-    user it also needs 4,000 ions and a score of a third, no other orientation may explain more than 0.8 of what the
-    first one explains, no other scale of the same one more than 0.9, and no other crystal structure more. A map of
+    user it also needs 4,000 ions and a score of a third, no such result may explain more than 0.8 of what the
+    first one explains, and no other crystal structure more. A map of
     noise has a score of 0. Marks that no orientation explains, or that contradict the map, are named in the reason, and
     the map is not decided. `Indexing.deciding_marks` says which mark would decide.
 
@@ -468,11 +466,7 @@ def _judged(measured, disc, bins, material, patterns, fits, proper, n, bounds, m
     if len(fits) > 1:
         margin = float(evidence[0] - evidence[1])
     next_best = max(scores[1:], default=0.0)
-    alike = any(
-        score >= (RIVAL if misorientation(fit.matrix, fits[0][1].matrix, proper) > DIFFERENT else SCALE_RIVAL) * best
-        for (_, fit), score in zip(fits[1:], scores[1:], strict=True)
-    )
-    decided = margin > DECIDED and (marked or not alike)
+    decided = margin > DECIDED and (marked or next_best < RIVAL * best)
     floor = f"{np.floor(margin):.0f}"  # 11.6 is not 12
     numbers = f"{best:.2f} of the structure instead of {next_best:.2f} (margin {floor}; {DECIDED:g} is needed)"
     if not structured:
