@@ -36,7 +36,8 @@ cdef class Octree:
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil
     cdef int collect_single(self, const double* centre, double radius, double opening_angle, int n_balls,
-                            const double* balls, Sources* sources, SingleSources* near, SingleSources* far) except -1 nogil
+                            const double* balls, Sources* sources, SingleSources* near, SingleSources* far
+                            ) except -1 nogil
     cdef Index within(self, double px, double py, double pz, double radius, int* slots, Index most) noexcept nogil
     cdef void mark(self, Index node) noexcept nogil
     cdef int field_at(self, double px, double py, double pz, double opening_angle, double* field) except -1 nogil

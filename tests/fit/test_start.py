@@ -150,7 +150,7 @@ def test_names_of_files_do_not_become_settings(found, tmp_path, name):
     assert tomllib.loads((tmp_path / "mine.toml").read_text(encoding="utf-8")) == usual
 
 
-@pytest.mark.parametrize("name", ["Ni", 'My "alloy"\n[tip]', "Ünobtainium"])
+@pytest.mark.parametrize("name", ["Ni", 'My "alloy" = [tip] \\n', "Ünobtainium"])
 def test_a_material_of_a_user_is_that_of_the_run(found, tmp_path, name):
     _, indexing = found
     mine = ae.Material(

@@ -97,7 +97,7 @@ def _distance(mask, bin_size):
     return scipy.ndimage.distance_transform_edt(np.pad(mask, 1), sampling=bin_size[::-1])[1:-1, 1:-1]
 
 
-def polar_grid(rings, azimuths):
+def polar_grid(rings: int, azimuths: int) -> tuple[Floats, Floats]:
     """Radii, shape (rings,), as fractions of the rim, and azimuths [rad]."""
     return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
 
@@ -232,7 +232,7 @@ def search(
     return starts
 
 
-def oriented(turn, mirror, angle):
+def oriented(turn: Floats, mirror: bool, angle: float) -> Floats:
     """Rotation from crystal to specimen of a result of the search."""
     cosine, sine = np.cos(angle), np.sin(angle)
     about = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
