@@ -82,6 +82,7 @@ def test_the_field_factor_of_a_run_is_that_of_its_apex():
     np.testing.assert_allclose(field_factor(run), 2.5, rtol=0.01)  # the radii are known to 0.08 of 14 nm
 
 
+@pytest.mark.slow
 def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):
     """Fewer ions land within 3 degrees of the {024} and {135} poles, which lie off the dark zone lines, than around."""
     found = ae.analysis.image_compression(run20)

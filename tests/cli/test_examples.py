@@ -89,6 +89,7 @@ SMALLER = {  # texts of the settings files and what stands for them in a test
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # of few ions and small specimens
 @pytest.mark.parametrize("name", SETTINGS)
 def test_the_settings_files_work(name, folder, capsys):

@@ -168,6 +168,7 @@ def test_the_projection_is_nearly_straight(lens):
     assert 1 / ratio.mean() == pytest.approx(lens.compression(40.0), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_there_and_back(lens):
     angles = np.array([0.0, 1e-3, 10.0, 30.0, 45.0, 50.0])
     for radius in (40.0, np.array([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])):

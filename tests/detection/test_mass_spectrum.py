@@ -42,6 +42,7 @@ def recorded(ions, distance, time_zero, voltages=(4000, 4400), n=20_000, backgro
     return ae.Hits(x=x, y=y, time_of_flight=time, voltage=voltage)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(
     ("ions", "distance", "time_zero", "voltages"),

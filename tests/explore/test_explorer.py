@@ -379,6 +379,7 @@ def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     assert found.verdict == "doubtful" and explorer._structures(maps)[0] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("emission", [ae.Unperturbed(), ae.RollUp(0.2)], ids=repr)
 def test_the_verdict_takes_lines_about_the_pole(run20, emission, monkeypatch):
     """Maps of one crystal have the same symmetries, also if one of them has dark lines where the other's are bright."""

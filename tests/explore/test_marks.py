@@ -36,6 +36,7 @@ def misorientation(first, second):
     return np.degrees(np.arccos(np.clip((normals[0] @ normals[1].T).max(axis=1).min(), -1, 1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("metal", "axis"),
     [

@@ -598,6 +598,7 @@ def test_settings_are_written_and_run(measured, tmp_path, monkeypatch):
     assert panel.start.label == "start the run"
 
 
+@pytest.mark.slow
 def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     """From marks to a run that opens with the emission that its settings recommend; marks outlive the page."""
     monkeypatch.chdir(tmp_path)

@@ -506,7 +506,7 @@ def measured_map(other, perturbation):
     return replace(frame, values=sum(draws))
 
 
-@pytest.fixture(scope="module", params=["roll-up", pytest.param("lateral", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in ("roll-up", "lateral")])
 def twin(request, run, other):
     """A study of a map with hidden energies."""
     hidden, truth = TWINS[request.param]

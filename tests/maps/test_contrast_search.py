@@ -86,6 +86,7 @@ def direct_evidence(disc, patterns, matrix, scale):
     return evidence((pictures * areas) @ pictures.T, cross[:, None], terms.priors, terms.signed)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.6, -0.5])
 def test_bright_and_dark_lines_give_the_orientation(amplitude):
     """The truth has more evidence than all results, and is among them within the steps of the search."""

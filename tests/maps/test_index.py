@@ -393,6 +393,7 @@ def nearest_of_family(candidate, place, plane):
     return float(np.nanmin(np.hypot(*(places - place).T)))
 
 
+@pytest.mark.slow
 def test_the_same_axis_at_another_scale_is_a_rival():
     """A map of two halves with one orientation and scales of 55 and 70 mm/rad: no other orientation explains it."""
     halves = [

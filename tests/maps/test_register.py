@@ -90,6 +90,7 @@ def off(found, true, radius):
 # ---- from maps -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "scale, mirror, radius, shift, seed, scales",
     [

@@ -62,6 +62,7 @@ TITLES = (None, "0.75 roll-up + 0.25 lateral velocity, 0.155 ± 0.155 eV")
 PICTURES = list(product((100, 150, 1500), TITLES, (0.6, 1.0, 1.1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "half, title, height",
     # every other one: each half with each height, each with and without a title

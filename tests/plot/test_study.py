@@ -185,6 +185,7 @@ def test_doubts(study):
         assert doubts(changed | {"likeness": {"verdict": "doubtful"}}) == []  # of numbers that are not given
 
 
+@pytest.mark.slow
 def test_without_resamples_and_correction(study, tmp_path):
     settings = replace(study.settings, resamples=0, allow_noise=False)
     bare = replace(

@@ -298,6 +298,7 @@ def hold(path):
     lock.release()
 
 
+@pytest.mark.slow
 @FORK
 def test_one_process_at_a_time(tmp_path, processes):
     path = tmp_path / "run.h5"

@@ -284,6 +284,7 @@ def test_bad_fields_of_view_are_refused(value):
         ae.simulation.FlightSettings(field_of_view=value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lens", ["", '[microscope]\npreset = "local electrode"\n'])
 def test_a_settings_file_has_a_field_of_view(tmp_path, lens):
     path = tmp_path / "view.toml"

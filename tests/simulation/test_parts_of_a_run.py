@@ -76,6 +76,7 @@ def test_a_file_with_rows_in_another_order_is_refused(run, real, tmp_path):
 # ---- join ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cuts", [[], [0, 75, 150], *(pytest.param(cuts, marks=pytest.mark.slow) for cuts in ([50], [50, 90]))]
 )

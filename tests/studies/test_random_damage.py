@@ -111,6 +111,7 @@ def work(sweep):
             run_point(sweep.folder_of(point.key))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mutants", "seed"), [(25, 1), *(pytest.param(500, seed, marks=pytest.mark.slow) for seed in (2, 3))]
 )

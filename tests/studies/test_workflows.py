@@ -141,6 +141,7 @@ def test_a_comparison_of_data_in_memory_writes_nothing_unless_it_is_asked_to(fol
     assert not Path("other").exists()
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_comparison_takes_what_a_simulation_returned_and_reads_nothing_twice(folder, pair, monkeypatch):
     save_map("map.npz", pair[1])

@@ -119,6 +119,7 @@ def test_an_interrupt_saves_all_ions_and_the_next_call_continues(tmp_path):
     check_done(sweep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", [0.3, 1.5])
 def test_an_interrupt_ends_the_work_at_any_time(tmp_path, moment):
     sweep = planned(tmp_path, TWO_LONG, LONG)

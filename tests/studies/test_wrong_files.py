@@ -201,6 +201,7 @@ def test_one_damaged_run_does_not_stop_the_others(sweep, damage):
 # ---- links and pipes -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_does_not_wait_for_a_pipe(sweep):
     keys = reopen(sweep, 0, 1, 2)
     for key, name in zip(keys, ("settings.toml", "work.json", "lock"), strict=True):

@@ -97,7 +97,7 @@ def _distance(mask, bin_size):
     return scipy.ndimage.distance_transform_edt(np.pad(mask, 1), sampling=bin_size[::-1])[1:-1, 1:-1]
 
 
-def polar_grid(rings: int, azimuths: int) -> tuple[Floats, Floats]:
+def polar_grid(rings: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
     """Radii, shape (rings,), as fractions of the rim, and azimuths [rad]."""
     return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
 
