@@ -282,9 +282,9 @@ def index(
 
     The map is `decided` if the margin to the next result is above 12: another orientation, by more than 6 degrees, or
     the same one at a scale that changes the half angle of the field of view by more than 6 degrees. Without marks of a
-    user it also needs 4,000 ions and a score of a third, no such result may explain more than 0.8 of what the
-    first one explains, and no other crystal structure more. A map of
-    noise has a score of 0. Marks that no orientation explains, or that contradict the map, are named in the reason, and
+    user it also needs 4,000 ions and a score of a third, no such result may explain more than 0.8 of what the first one
+    explains, and no other crystal structure more. A map of noise has a score of 0. Marks that no orientation explains,
+    or that contradict the map, are named in the reason, and
     the map is not decided. `Indexing.deciding_marks` says which mark would decide.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
