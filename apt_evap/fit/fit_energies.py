@@ -112,7 +112,7 @@ def fit_energies(
 
     Examples
     --------
-    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(600)
+    >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1)), seed=1).run(1_000)
     >>> measured = run.hits(ae.RollUp(0.2)).map(bins=16, extent=(-60, 60, -60, 60))  # energy to be found
     >>> identity = ae.Registration(rotation=0.0, scale=1.0, shift=(0.0, 0.0))
     >>> grid = ae.fit.EnergyGrid("roll-up", means=(0.1, 0.2, 0.3))

@@ -235,10 +235,12 @@ def test_help(capsys):
 @pytest.mark.slow
 @NO_PICTURES
 def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
-    """A map that has nothing to do with the run."""
-    random = np.random.default_rng(3)
-    edges = np.linspace(-2, 2, 41)
-    np.savez("noise.npz", counts=random.poisson(30, (40, 40)), x_edges_cm=edges, y_edges_cm=edges)
+    """A map of the same ions turned by random angles: it lies on the run, and has none of its lines."""
+    random = np.random.default_rng(1)
+    hits = ae.load("other.h5").hits(ROLLUP).within_circle(60.0)
+    radius, angle = np.hypot(hits.x, hits.y), random.uniform(0, 2 * np.pi, len(hits.x))
+    map = replace(hits, x=radius * np.cos(angle), y=radius * np.sin(angle)).map(bins=40, extent=(-60, 60, -60, 60))
+    np.savez("noise.npz", counts=map.counts, x_edges_cm=map.x_edges / 10, y_edges_cm=map.y_edges / 10)
     assert main(["compare", "run.h5", "noise.npz", "-o", "noise", *QUICK]) == 0
     out, err = capsys.readouterr()
     assert "registration" not in err and out.count("the registration, correlation") == 1
