@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.codec import to_python
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, digest
 from apt_evap.analysis.apex import image_compression
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.detection.binning import MAX_BINS, bins_for, field_of_view
@@ -243,8 +243,17 @@ class Explorer:
 
     def keep_ions(self, other: "Explorer") -> None:
         """Keep the selection of ions of another explorer, if it has the same measurement."""
-        if isinstance(other.ions_of_file, MeasuredIons) and other.names[1] == self.names[1]:
-            self.ions_of_file = other.ions_of_file
+        mine, theirs = self.ions_of_file, other.ions_of_file
+        if not (
+            isinstance(mine, MeasuredIons) and isinstance(theirs, MeasuredIons) and other.names[1] == self.names[1]
+        ):
+            return
+        columns = [
+            (ions.all.x, ions.all.y, ions.all.mass_to_charge, ions.all.time_of_flight) for ions in (mine, theirs)
+        ]
+        first, second = (digest(*(values for values in of if values is not None)) for of in columns)
+        if first == second:  # the file may have been replaced
+            self.ions_of_file = theirs
             self.selection_changed()
             if self.is_comparison and not self.registered:
                 self.registration = self._same_size()

@@ -22,6 +22,7 @@ from bokeh.models import (
 )
 
 from apt_evap._common.codec import to_python
+from apt_evap._common.validation import digest
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
@@ -39,6 +40,7 @@ from apt_evap.specimen.materials import MATERIALS
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 MOVED = "moved by hand"
+_OTHER_IONS = "the ions have changed: search again"
 _REACH = 0.3  # distance between both handles, as a fraction of the width of the map
 # Rotation, scale and centre of the handles move the overlay. Python computes it when the mouse is released.
 _FOLLOW = """
@@ -75,7 +77,8 @@ class IndexPanel:
     put_code : callable
         Shows Python lines.
     kept : dict, optional
-        Crystal, marks and candidates; what an earlier page of this measurement left there is shown again.
+        Crystal, marks and candidates; what an earlier page of this measurement left there is shown again, candidates of
+        a search only for the same ions.
     """
 
     def __init__(
@@ -107,7 +110,12 @@ class IndexPanel:
         if marks is not None:
             self.marks.data = marks
         if candidates:
-            self._put(*candidates)
+            rows, text, searched = candidates
+            indexing, content = searched or (None, None)
+            if indexing is None or content == self._content():
+                self._put(rows, text, indexing)
+            else:
+                self._put([], _OTHER_IONS)
 
     def close(self) -> None:
         """End the fits."""
@@ -192,6 +200,17 @@ class IndexPanel:
         """Add a mark of the chosen family: a pole, or a point on a zone line from the first pole to such a pole."""
         new = {"x": x, "y": y, "family": self.family.value, "line": self._line if of_line else 0}
         self.marks.data = {name: [*values, new[name]] for name, values in self.marks.data.items()}
+
+    def ions_changed(self) -> None:
+        """Forget the candidates of a search, also of one that goes on: they are those of other ions. Marks stay."""
+        if self._indexing is not None or self.search.disabled:
+            self._put([], _OTHER_IONS)
+
+    def _content(self):
+        measured = self._measured()
+        if isinstance(measured, DetectorMap):
+            return digest(measured.values, measured.mask, measured.x_edges, measured.y_edges)
+        return digest(measured.x, measured.y)
 
     def propose(self, name: str) -> None:
         """Choose the crystal, if none is chosen."""
@@ -360,8 +379,10 @@ class IndexPanel:
         self._later(put, 0)
 
     def _put(self, candidates, text, indexing=None):
+        """Show candidates; those of a search, with the digest of the measurement in which they were found."""
         self.candidates, self._indexing, self._awaited = candidates, indexing, None
-        self._hint, self._kept["candidates"] = text, (candidates, text, indexing)
+        searched = None if indexing is None else (indexing, self._content())
+        self._hint, self._kept["candidates"] = text, (candidates, text, searched)
         options = []
         for number, (orientation, _, quality) in enumerate(candidates):
             axis = " ".join(f"{component:.2f}" for component in orientation.axis)

@@ -167,6 +167,7 @@ class Page:
     def _ions_selected(self):
         """Show other measured ions; they lie where those before lay."""
         self.explorer.selection_changed()
+        self.index.ions_changed()
         self.summary.put_facts()
         self.request(False)
 

@@ -38,7 +38,6 @@ const told = text => { zone.text = text }
 const send = file => {
   const query = new URLSearchParams(location.search)
   query.set("name", file.name)
-  query.set("size", file.size)
   const request = new XMLHttpRequest()
   request.open("POST", "upload?" + query)
   request.upload.onprogress = event => told(`copying ${file.name}: ${Math.round(100 * event.loaded / event.total)} %`)

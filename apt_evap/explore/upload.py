@@ -1,5 +1,6 @@
 """Files that a browser sends: they are put into the current folder, and replace nothing."""
 
+import os
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 from bokeh.util.token import check_session_id_signature
 from tornado.web import HTTPError, RequestHandler, stream_request_body
 
-from apt_evap._common.files import replace_file
+from apt_evap._common.files import open_regular, replace_file
 from apt_evap._common.validation import short_text
 from apt_evap.explore.start_page import MEASUREMENTS, RUNS
 
@@ -20,9 +21,9 @@ class _StoppedError(Exception):
 
 @stream_request_body
 class UploadHandler(RequestHandler):
-    """Handler of ``POST upload?bokeh-session-id=...&name=...&size=...``; the answer is the path of the file.
+    """Handler of ``POST upload?bokeh-session-id=...&name=...``; the answer is the path of the file.
 
-    A file of this name and size that is in the folder is taken for the same one.
+    A file of this name in the folder stays: it is opened if its content is the same, and the request is refused if not.
     """
 
     def initialize(self, key: bytes) -> None:
@@ -30,6 +31,7 @@ class UploadHandler(RequestHandler):
         self._key = key
         self._file: Any = None
         self._writing: Any = None
+        self._present: Any = None  # a file of this name in the folder, with which the content is compared
         self._refused = ""
 
     def prepare(self) -> None:
@@ -39,7 +41,7 @@ class UploadHandler(RequestHandler):
             raise HTTPError(403)
         connection: Any = self.request.connection
         connection.set_max_body_size(_LARGEST)
-        name, size = self.get_query_argument("name"), self.get_query_argument("size")
+        name = self.get_query_argument("name")
         self._path = Path(name)
         if name != self._path.name or name in ("", ".", "..") or "\\" in name:
             self._refused = f"a dropped file must have a plain name, got {short_text(name)}"
@@ -47,8 +49,7 @@ class UploadHandler(RequestHandler):
             known = ", ".join((*MEASUREMENTS, *RUNS))
             self._refused = f"a dropped file must be one of {known}, got {short_text(name)}"
         elif self._path.exists():
-            if str(self._path.stat().st_size) != size:
-                self._refused = f"{short_text(name)} exists in this folder and has another size: rename one of them"
+            self._guarded(self._open_present)
         else:
             self._guarded(self._begin)
 
@@ -56,11 +57,15 @@ class UploadHandler(RequestHandler):
         """Write a part of the file."""
         if self._file is not None:
             self._guarded(partial(self._file.write, chunk))
+        elif self._present is not None:
+            self._guarded(partial(self._compare, chunk))
 
     def post(self) -> None:
         """Answer when the file is complete."""
         if self._writing is not None:
             self._guarded(partial(self._end, None))
+        if self._present is not None:
+            self._guarded(partial(self._compare, b""))
         if self._refused:
             self.set_status(409)
             self.finish(self._refused)
@@ -69,8 +74,29 @@ class UploadHandler(RequestHandler):
 
     def on_connection_close(self) -> None:
         """Remove a file that is not complete."""
+        self._close_present()
         if self._writing is not None:
             self._guarded(partial(self._end, _StoppedError("the browser has gone")))
+
+    def on_finish(self) -> None:
+        """Close what was compared."""
+        self._close_present()
+
+    def _open_present(self):
+        self._present = open(open_regular(self._path, os.O_RDONLY | getattr(os, "O_BINARY", 0)), "rb")
+
+    def _compare(self, chunk):
+        """Refuse a chunk that is not the next one of the file in the folder; an empty one is its end."""
+        if self._present.read(len(chunk) or 1) != chunk:
+            self._close_present()
+            self._refused = (
+                f"{short_text(self._path.name)} exists in this folder with another content: rename one of them"
+            )
+
+    def _close_present(self):
+        present, self._present = self._present, None
+        if present is not None:
+            present.close()
 
     def _begin(self):
         self._writing = replace_file(self._path)

@@ -127,7 +127,7 @@ def judged(metal, run, line):
             (on, on_error), (beside, beside_error) = across(map, projection, pole, toward, 16)
             radial = ae.maps.pole_profile(map, projection, pole, np.arange(0, 11, 1.0)).density
             print(f"{name:30} on {on:.2f} +- {on_error:.2f} beside {beside:.2f} +- {beside_error:.2f} | pole",
-                  " ".join(f"{each:.2f}" for each in radial), flush=True)  # fmt: skip
+                  " ".join(f"{density:.2f}" for density in radial), flush=True)  # fmt: skip
             continue
         target = measured_fold(metal)
         fold = folded(map, orientation, projection, METALS[metal])

@@ -66,7 +66,7 @@ def main():
     scale = float(np.median(run.at_evaporation_field().energy_scales))
     orientation, projection = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
     found = poles(orientation.material, 10)
-    labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
+    labels = np.array(["{" + "".join(str(index) for index in np.sort(np.abs(plane))) + "}" for plane in found.planes])
     normals = orientation.directions(found.normals)
     nearest = orientation.nearest_pole(tuple(options.pole))
     pole = np.asarray(nearest.direction)
@@ -80,7 +80,7 @@ def main():
         for _, directions in families:
             (on, _), (beside, _) = across(map, projection, pole, directions, outer)
             lines.append(f"{on:.2f} {beside:.2f}")
-        print(f"{name:38}", " ".join(f"{each:.2f}" for each in radial), "|", ", ".join(lines), flush=True)
+        print(f"{name:38}", " ".join(f"{density:.2f}" for density in radial), "|", ", ".join(lines), flush=True)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def main():
         part = 0.0 if part is None else part.probabilities(run.emissions).mean()
         print(f"{options.run.name}, {name}: {part:.2f} roll, {maps[name].shown_ions}")
     found = poles(metal, 10)
-    labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
+    labels = np.array(["{" + "".join(str(index) for index in np.sort(np.abs(plane))) + "}" for plane in found.planes])
     normals = orientation.directions(found.normals)
     nearest = orientation.nearest_pole(tuple(options.pole))
     pole = np.asarray(nearest.direction)
@@ -59,7 +59,7 @@ def main():
     print(f"about {options.pole}, up to {outer:.0f} degrees")
     for name, map in maps.items():
         radial = by_degree(map, projection, nearest)
-        print(f"  {name:12} by degree", " ".join(f"{each:.2f}" for each in radial))
+        print(f"  {name:12} by degree", " ".join(f"{density:.2f}" for density in radial))
     for towards, directions in lines_about(pole, normals, labels) if outer > 8 else []:
         cells = []
         for map in maps.values():

@@ -28,6 +28,7 @@ from apt_evap.cli._explorer_of_files import explorer_and_view
 from apt_evap.cli._files import read_registration
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.map_views import MODES
+from apt_evap.explore.measured_ions import IonSelection
 from apt_evap.explore.page import Page
 from apt_evap.explore.run_panel import ServerState
 from apt_evap.explore.server import serve
@@ -638,6 +639,41 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     assert len(again.index.lines.data["x"]) > 10
     again.close()
     opened.page.close()
+
+
+def test_candidates_of_a_search_are_those_of_its_ions():
+    """Other ions, on the same page or in a file of the same name, have none; marks and their fits are kept."""
+    rng = np.random.default_rng(5)
+    x, y = rng.normal(size=(2, 2_000)) * 8.0
+    hits = ae.Hits(x=x, y=y, mass_to_charge=rng.choice([14.0, 63.0], 2_000))
+    state, row = ServerState(), (ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0), "score 0.50")
+
+    def page_of(ions):
+        return Opened(Explorer(None, ions, measured_arguments=["ions.epos"]), state=state).page
+
+    first = page_of(hits)
+    first.index.material.value = "Ni"
+    first.index._put([row], "indexed", object())
+    assert page_of(hits).index.candidates == [row]
+    assert page_of(hits[::2]).index.candidates == []  # the file was replaced
+    first.index._put([row], "indexed", object())
+    first.explorer.ions_of_file.select(IonSelection(mass=(60.0, 70.0)))
+    first._ions_selected()
+    assert first.index.candidates == [] and "search again" in first.index.text.text
+    first.index._put([row], "a fit of marks")
+    assert page_of(hits[::2]).index.candidates == [row]
+
+
+def test_ions_of_a_replaced_file_are_not_kept():
+    """A run that is opened keeps the selection of the same ions, not the ions of a file that was replaced."""
+    hits = ae.Hits(x=np.arange(9.0), y=np.zeros(9), mass_to_charge=np.full(9, 63.0))
+    other = replace(hits, y=np.ones(9))
+    before = Explorer(None, hits, measured_arguments=["ions.epos"])
+    before.ions_of_file.select(IonSelection(ions=(0, 4)))
+    for ions, n in ((hits, 4), (other, 9)):
+        opened = Explorer(None, ions, measured_arguments=["ions.epos"])
+        opened.keep_ions(before)
+        assert len(opened.measured) == n and np.array_equal(opened.measured.y, ions.y[:n])
 
 
 def test_the_spectrum_selects_ions(tmp_path, monkeypatch):

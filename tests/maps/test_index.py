@@ -404,7 +404,9 @@ def test_the_same_axis_at_another_scale_is_a_rival():
     sums = ae.DetectorMap.from_array(map.values + other.values, map.x_edges, map.y_edges, map.mask, is_counts=True)
     found = quickly(sums, "Ni", scales=(48.0, 75.0))
     assert not found.decided
-    assert sorted(each.projection.scale for each in found.candidates[:2]) == pytest.approx([55.0, 70.0], rel=0.02)
+    assert sorted(candidate.projection.scale for candidate in found.candidates[:2]) == pytest.approx(
+        [55.0, 70.0], rel=0.02
+    )
     for candidate in found.candidates[:2]:
         assert misorientation(candidate.orientation.matrix, orientation.matrix, proper("fcc")) < 1.0
     assert quickly(map, "Ni", scales=(48.0, 75.0)).decided  # one of the halves

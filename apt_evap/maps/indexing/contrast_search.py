@@ -54,7 +54,7 @@ AXIS_STEP, SCALE_STEP = 2.5, 0.07
 _FAMILIES = 5  # of poles
 _LINE_WIDTH = np.radians(2.0)  # standard deviation: wider than most lines, for the steps of the search
 _POLE_RADIUS = 200.0  # lattice constants: the facet of planes d apart is sqrt(2 d / R) wide
-_FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms are filtered anew
+_FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms are filtered again
 
 
 def local_contrast(values: Floats, mask: np.ndarray, narrow: Floats, wide: Floats) -> Floats:
