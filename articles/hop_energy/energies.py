@@ -20,14 +20,18 @@ sys.path.append(str(Path(__file__).parents[1] / "three_metals"))
 from judge import METALS, amplitude, folded, map_of, projection_of, rings
 from measured_numbers import measured_fold
 from predictions import across
-from runs import AXES, prepared
+from runs import AXES, advanced
 from shares import CHOICES, of_file
 
 import apt_evap as ae
 from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
 from apt_evap.maps.crystallography.directions import poles
 
-AXES = AXES | {"Mg": ((0, 0, 0, 1), 20.0)}  # and half the opening angle of the flights [degrees]
+PREDICTED = {
+    "Ni-001": ((0, 0, 1), 19.0), "Fe-001": ((0, 0, 1), 19.0), "Fe-025": ((0, 2, 5), 23.0), "Fe-112": ((1, 1, 2), 19.0),
+    "Si-001": ((0, 0, 1), 19.0), "W-011": ((0, 1, 1), 19.0),
+}  # fmt: skip
+AXES = AXES | {"Mg": ((0, 0, 0, 1), 20.0)} | PREDICTED  # and half the opening angle of the flights [degrees]
 PARTS = (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
 # amplitudes of larger tips over those of R = 80 a, by the rule of the metal (../three_metals)
 LARGER = {
@@ -88,12 +92,20 @@ class ByGain:
 
 
 def simulated(metal, radius, skip, ions, threads):
-    """Run with wide responses."""
+    """Run with responses for every emission."""
     axis, half_angle = AXES[metal]
-    material = ae.material(metal)
+    material = ae.material(metal.partition("-")[0])
     size = radius * material.a
     tip = ae.Tip(material, size, axis=axis, shank_length=size, depth=8 * material.a, offset_seed=1)
-    return prepared(tip, ae.ConstantPotential(), half_angle, skip, 1, threads)[0].run(ions, progress=False)
+    simulation = advanced(tip, half_angle, skip, rule=ae.ConstantPotential(), seed=1, n_threads=threads)
+    return simulation.run(ions, progress=False)
+
+
+def gain_line(metal, path):
+    """Start and slope of the gain over the charge ratio [eV], from a file of `hops.py`."""
+    hops = of_file(path)
+    slope, start = np.polyfit(hops["ratio"], CHOICES["charge above, half, cap, F_evap"].gains(metal, hops), 1)
+    return start, slope
 
 
 def rules(metal, line, scale):
@@ -166,10 +178,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path)
     parser.add_argument("what", choices=("simulate", "judge"))
-    parser.add_argument("metal", choices=("W", "Ni", "Al", "Mg"))
+    parser.add_argument("metal", choices=AXES)
     parser.add_argument("radius", type=int, help="in lattice constants")
     parser.add_argument("--skip", type=int, default=30_000)
     parser.add_argument("--ions", type=int, default=90_000)
+    parser.add_argument("--hops", type=Path, help="file of hops.py, if there is none for this radius")
     parser.add_argument("--threads", type=int)
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
@@ -178,8 +191,7 @@ def main():
     if options.what == "simulate":
         simulated(metal, radius, options.skip, options.ions, options.threads).save(path)
         return
-    hops = of_file(options.runs / f"{metal}_{radius}_hops.npz")
-    slope, start = np.polyfit(hops["ratio"], CHOICES["charge above, half, cap, F_evap"].gains(metal, hops), 1)
+    start, slope = gain_line(metal, options.hops or options.runs / f"{metal}_{radius}_hops.npz")
     run = ae.load(path)
     law = ae.emission.Migration.of(metal)
     print(f"{metal}, R = {radius} a, {len(run):,} ions, G = {start:.2f} + {slope:.2f} x; part that rolls: rule "

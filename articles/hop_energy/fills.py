@@ -53,6 +53,17 @@ def by_degree(map, projection, pole, reach=12):
     return [np.nanmean(folded.density[(angle >= a) & (angle < a + 1)]) for a in range(reach)]
 
 
+def dark_up_to(densities):
+    """Angle from the pole at which the density rises to the mean, and that of the ring behind it [degrees]."""
+    densities = np.asarray(densities)
+    first = int(np.argmax(densities >= 1.0))
+    ring = first + int(np.argmax(densities[first : first + 4]))
+    if first == 0:
+        return 0.0, ring + 0.5
+    low, high = densities[first - 1 : first + 1]
+    return first - 0.5 + (1.0 - low) / (high - low), ring + 0.5
+
+
 def main():
     """Print the table of one run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -80,7 +91,10 @@ def main():
         for _, directions in families:
             (on, _), (beside, _) = across(map, projection, pole, directions, outer)
             lines.append(f"{on:.2f} {beside:.2f}")
-        print(f"{name:38}", " ".join(f"{density:.2f}" for density in radial), "|", ", ".join(lines), flush=True)
+        edges = "dark up to {:.1f}, ring at {:.1f}".format(*dark_up_to(radial))
+        print(
+            f"{name:38}", " ".join(f"{density:.2f}" for density in radial), f"| {edges} |", ", ".join(lines), flush=True
+        )
 
 
 if __name__ == "__main__":

@@ -60,14 +60,24 @@ def emissions(scale):
 
 def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, shells=1):
     """Simulation of a tip after some events without flights, and the simulated energy per real energy."""
-    common = {"seed": seed, "rule": rule, "n_threads": threads, "law": law}
-    common["response_settings"] = ae.ResponseSettings.wide(shells=shells)  # records the neighbours for the sharpness
-    pilot = ae.Simulation(tip, **common).run(256, responses=False, progress=False)
+    common = {"seed": seed, "rule": rule, "n_threads": threads, "law": law, "shells": shells}
+    pilot = simulation_of(tip, **common).run(256, responses=False, progress=False)
     scale = float(np.median(pilot.at_evaporation_field().energy_scales))
-    simulation = ae.Simulation(tip, flight_settings=ae.simulation.FlightSettings(field_of_view=half_angle), **common)
+    return advanced(tip, half_angle, skip, **common), scale
+
+
+def simulation_of(tip, *, shells, **settings):
+    """Simulation whose responses serve every emission; they record the neighbours for the sharpness."""
+    return ae.Simulation(tip, response_settings=ae.ResponseSettings.wide(shells=shells), **settings)
+
+
+def advanced(tip, half_angle, skip, *, shells=1, **settings):
+    """Simulation of a tip after some events without flights."""
+    flights = ae.simulation.FlightSettings(field_of_view=half_angle)
+    simulation = simulation_of(tip, shells=shells, flight_settings=flights, **settings)
     for _ in simulation.emitter.advance(skip):
         pass
-    return simulation, scale
+    return simulation
 
 
 def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, shells):
