@@ -16,14 +16,15 @@ from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
-from apt_evap.emission.perturbations import LateralVelocity, Unperturbed
+from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp, Unperturbed
 from apt_evap.fit.comparison import FoldedComparison
 from apt_evap.fit.energy_search import EnergySearch, register_repeatedly
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima
 from apt_evap.fit.intervals import intervals as intervals_of
 from apt_evap.fit.structure import PoleMeasure, StructureScores
-from apt_evap.fit.study import Score, Study
+from apt_evap.fit.study import RULE_OF_METAL, Score, Study
+from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.similarity import WINDOW
 from apt_evap.simulation.run import Run
@@ -192,12 +193,27 @@ def _registered(search):
 
 
 def _compared_maps(search, best):
-    """Maps, scores and scores without noise correction, by name: without perturbation, thermal, and at the best one."""
+    """Maps, scores and scores without noise correction, by name: of the baselines and the best energies."""
     thermal = LateralVelocity(Thermal(search.settings.temperature))
+    perturbations = {"unperturbed": Unperturbed(), "thermal": thermal}
+    if (rule := _rule_of_metal(search.run)) is not None:
+        perturbations[RULE_OF_METAL] = rule
     maps, scores, plain_scores = {}, {}, {}
-    for name, perturbation in (("unperturbed", Unperturbed()), ("thermal", thermal), ("optimum", best)):
+    for name, perturbation in (perturbations | {"optimum": best}).items():
         maps[name], scores[name], plain_scores[name] = search.map_and_scores(perturbation)
     return maps, scores, plain_scores
+
+
+def _rule_of_metal(run: Run) -> Perturbation | None:
+    """`RollUp.of_metal`, as `start` writes it; None unless the run is one of a pure metal at a constant potential."""
+    charges = dict(run.settings.get("rule") or {}).get("name")
+    crystal = Orientation.known(run.settings["tip"])
+    if charges != "ConstantPotential" or run.emissions.charge_ratios is None or crystal is None:
+        return None
+    if crystal.material.cohesive_energy is None or len(set(run.elements)) > 1:
+        return None
+    scale = float(np.median(run.at_evaporation_field().energy_scales)) if run.units is None else 1.0
+    return RollUp.of_metal(crystal.material, energy_scale=scale)
 
 
 def _shares(cells, shape):

@@ -26,6 +26,7 @@ from apt_evap.config.toml_text import comment
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import RollUp
+from apt_evap.emission.roll_probability import Migration
 from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration
@@ -353,10 +354,17 @@ def _of_metal(material):
         perturbation = RollUp.of_metal(material)
     except ValueError:
         return []
+    low, middle, high = (
+        Migration(material.cohesive_energy, factor * material.evaporation_field).threshold
+        for factor in (1 + EVAPORATION_FIELD_ERROR, 1.0, 1 - EVAPORATION_FIELD_ERROR)
+    )
     return [
         "",
         "[[maps.panels]]",
         'title = "rule of the metal"',
-        "# from the cohesive energy and the evaporation field; nothing is taken from this map",
+        "# its numbers were selected with maps of W, Ni and Al, none with this map. Atoms roll up if the charge of a "
+        f"neighbour over theirs is above {middle:.2f};",
+        f"# for an evaporation field that is a tenth higher or lower, above {low:.2f} or {high:.2f}, which may decide "
+        "which lines are bright",
         f"perturbation = {write_perturbation(perturbation)}",
     ]

@@ -28,6 +28,8 @@ from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_pla
 LEAST_CEILING = 0.1
 """Score of two halves of the measured ions below which scores are not corrected for noise: it would be a division of
 noise by noise."""
+RULE_OF_METAL = "rule of the metal"
+"""Baseline of `RollUp.of_metal`, for which nothing is fitted to the map."""
 ABOVE_NOISE = 2.0
 """Standard deviations above 0 of an uncorrected score that is corrected for noise."""
 
@@ -126,9 +128,10 @@ class Study:
     optimum, refined : Optimum
         The best point of the grid, and the maximum of a spline around it.
     baselines : dict of Score
-        Scores of the "unperturbed" and "thermal" maps.
+        Scores of the "unperturbed" and "thermal" maps. For a pure metal at a constant potential with wide responses
+        also of the "rule of the metal", `RollUp.of_metal`: nothing in it is fitted to the map.
     plain : dict of Score
-        Uncorrected scores of "unperturbed", "thermal" and "optimum", for comparison with the ceiling.
+        Uncorrected scores of the baselines and of the "optimum", for comparison with the ceiling.
     gain : Score
         Score of the optimum minus that of the unperturbed map, for paired resamples.
     gain_share : float
@@ -140,7 +143,7 @@ class Study:
     measured : DetectorMap
         The measured map; its mask is the compared region.
     maps : dict of DetectorMap
-        Simulated maps in the measured frame: "unperturbed", "thermal", "optimum".
+        Simulated maps in the measured frame: those of the baselines, and "optimum".
     structure : StructureScores or None
         Rings about the pole: contrast of the zone lines, radial densities, and folded maps. None if no pole with its
         rings is inside the compared region; ``provenance["structure"]`` contains the reason.
@@ -220,6 +223,9 @@ class Study:
         best = self.optimum.score if corrected else self.plain["optimum"]
         unperturbed = self.baselines["unperturbed"] if corrected else self.plain["unperturbed"]
         text = f"{self.settings.score_name} {best}, unperturbed {unperturbed}"
+        if RULE_OF_METAL in self.baselines:
+            rule = (self.baselines if corrected else self.plain)[RULE_OF_METAL]
+            text += f", {RULE_OF_METAL} (not fitted) {rule}"
         if corrected:
             text += f"; uncorrected for noise {self.plain['optimum']}"
         elif self.settings.allow_noise:

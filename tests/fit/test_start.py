@@ -45,6 +45,8 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
     panel = config.maps.panels[1].perturbation
     assert isinstance(panel, ae.RollUp) and panel.probability == pytest.approx(0.5, abs=0.15)
     assert config.maps.panels[2].perturbation == ae.RollUp.of_metal("Ni")
+    for field in (35.0, 31.5, 38.5):  # as in the table, and as far as it is known
+        assert f"{ae.emission.Migration(4.44, field).threshold:.2f}" in start.text
     assert all("#" in line for line in start.text.splitlines() if line.startswith(("axis", "rotation", "apex", "ions")))
     assert np.isnan(start.radii).all() and "no voltages" in start.text
 

@@ -560,6 +560,7 @@ def test_unperturbed_is_clearly_less_alike(twin):
     assert study.gain.value > 5 * study.gain.error > 0
     assert study.gain_share == 1
     assert study.baselines["thermal"].value < best.value - 5 * best.error
+    assert set(study.baselines) == {"unperturbed", "thermal"}  # the rule of a metal is not for Robin's charges
 
 
 def test_what_a_study_holds(twin):
@@ -823,3 +824,32 @@ def test_pictures(twin, tmp_path):
         assert imread(tmp_path / name)[..., :3].std() > 0.1
     with pytest.raises(ValueError, match="circle"):
         ae.plot.side_by_side(study, circle=(0, 0, -1))
+
+
+# ---- the rule of a metal -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # tails of the energies
+def test_the_rule_of_the_metal_is_a_baseline_that_finds_its_own_map():
+    tip = ae.Tip("Ni", apex_radius=3.5, axis=(1, 1, 1), shank_length=3.5, offset_seed=1)
+    responses = ae.ResponseSettings.wide(energy_limit=4.0)
+    run = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential(), response_settings=responses).run(
+        1_500, progress=False
+    )
+    hidden = ae.RollUp.of_metal("Ni")
+    real = run.at_evaporation_field()
+    measured = replace(real, seed=2).hits(hidden).map(bins=20, extent=(-60, 60, -60, 60))
+    grid = EnergyGrid("lateral", means=(0.2, 0.4), relative_spreads=(1.0,))
+    studies = [
+        ae.fit_energies(simulated, measured, grid, FitSettings(resamples=2), registration=HERE)
+        for simulated in (real, run)
+    ]
+    for study in studies:
+        rule, best = study.baselines["rule of the metal"], study.optimum.score
+        assert rule.value > best.value + 0.05  # no energies in random directions have its lines
+        assert study.plain["rule of the metal"].value > study.plain["optimum"].value
+    # the energies of the rule are those of an experiment, whatever the voltage of the run
+    assert studies[0].baselines["rule of the metal"].value == pytest.approx(
+        studies[1].baselines["rule of the metal"].value, abs=0.02
+    )

@@ -11,7 +11,7 @@ from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
 from apt_evap.analysis.description import lens_text
-from apt_evap.fit.study import Score, Study
+from apt_evap.fit.study import RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.directions import plain_label
 from apt_evap.plot.report.html_page import (
     Page,
@@ -184,10 +184,10 @@ def _scores(study):
     corrected = (
         f"noise-corrected {study.settings.score_name}" if study.settings.allow_noise else study.settings.score_name
     )
-    names = ("unperturbed", "thermal", "optimum")
     scores = {**study.baselines, "optimum": study.optimum.score}
-    labels = {"thermal": f"thermal, {study.settings.temperature:g} K", "optimum": "best"}
-    rows = [(labels.get(name, name), scores[name], study.plain[name]) for name in names]
+    thermal = f"thermal, {study.settings.temperature:g} K"
+    labels = {"thermal": thermal, RULE_OF_METAL: f"{RULE_OF_METAL}, not fitted", "optimum": "best"}
+    rows = [(labels.get(name, name), score, study.plain[name]) for name, score in scores.items()]
     head = ["Map", corrected, f"uncorrected {study.settings.score_name}"]
     if not study.settings.allow_noise:
         rows, head = [row[:2] for row in rows], head[:2]
