@@ -33,13 +33,10 @@ PREDICTED = {
 }  # fmt: skip
 AXES = AXES | {"Mg": ((0, 0, 0, 1), 20.0)} | PREDICTED  # and half the opening angle of the flights [degrees]
 PARTS = (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
-# amplitudes of larger tips over those of R = 80 a, by the rule of the metal (../three_metals)
-LARGER = {
-    "W": {
-        160: np.array([0.92, 0.97, 1.23]) / [1.31, 1.49, 1.75],
-        230: np.array([0.69, 0.77, 1.03]) / [1.31, 1.49, 1.75],
-    },
-    "Ni": {160: np.array([1.18, 0.81, 0.98]) / [1.46, 1.09, 1.24]},
+# amplitudes by the rule of the metal for each radius (../three_metals): how they fall with it
+BY_RADIUS = {
+    "W": {80: (1.31, 1.49, 1.75), 160: (0.92, 0.97, 1.23), 230: (0.69, 0.77, 1.03)},
+    "Ni": {80: (1.46, 1.09, 1.24), 160: (1.18, 0.81, 0.98), 230: (1.01, 0.58, 0.74)},
 }
 ENERGIES = (0.03, 0.05, 0.1, 0.15, 0.2, 0.3, 0.5)  # eV
 
@@ -123,7 +120,7 @@ def rules(metal, line, scale):
         yield "one energy [eV]", energy, replace(rule, energy=spread)
 
 
-def judged(metal, run, line):
+def judged(metal, radius, run, line):
     """Print the table of one run."""
     scale = float(np.median(run.at_evaporation_field().energy_scales))
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
@@ -148,9 +145,12 @@ def judged(metal, run, line):
         text = " ".join(f"{value:5.2f}" for value in values)
         print(f"{name:30} correlation {fold.correlation(target):.2f}, amplitudes {text}", flush=True)
         series.setdefault(kind, []).append((number, values))
-    for radius, factors in {80: np.ones(3), **LARGER.get(metal, {})}.items():
+    known = BY_RADIUS.get(metal, {})
+    for larger in [radius, *(other for other in known if other > radius)]:
+        factors = np.divide(known[larger], known[radius]) if larger > radius else 1.0
         for kind, rows in list(series.items())[1:]:
-            best(f"R = {radius} a, {kind}", [number for number, _ in rows], [values * factors for _, values in rows])
+            numbers, values = zip(*rows, strict=True)
+            best(f"R = {larger} a, {kind}", numbers, [np.multiply(row, factors) for row in values])
 
 
 def best(name, numbers, amplitudes):
@@ -197,7 +197,7 @@ def main():
     print(f"{metal}, R = {radius} a, {len(run):,} ions, G = {start:.2f} + {slope:.2f} x; part that rolls: rule "
           f"{law.probabilities(run.emissions).mean():.2f}, by G "
           f"{ByGain(metal, (start, slope), 0.04, 1.0).probabilities(run.emissions).mean():.2f}")  # fmt: skip
-    judged(metal, run, (start, slope))
+    judged(metal, radius, run, (start, slope))
 
 
 if __name__ == "__main__":
