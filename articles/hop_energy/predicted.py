@@ -57,9 +57,10 @@ def rules_of(metal, temperature, scale, hops):
 
 
 def part_of(emission, run):
-    """Part of the ions that roll."""
+    """Part of the ions in the field of view that roll."""
     probability = emission if isinstance(emission, ByGain) else getattr(emission, "probability", None)
-    return 0.0 if probability is None else probability.probabilities(run.emissions).mean()
+    seen = run.emissions[~run.not_flown]
+    return 0.0 if probability is None else probability.probabilities(seen).mean()
 
 
 def shown(run, emissions, pole, projection):
