@@ -32,7 +32,7 @@ PREDICTED = {
     "Si-001": ((0, 0, 1), 19.0), "W-011": ((0, 1, 1), 19.0),
 }  # fmt: skip
 AXES = AXES | {"Mg": ((0, 0, 0, 1), 20.0)} | PREDICTED  # and half the opening angle of the flights [degrees]
-PARTS = (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.07, 0.1)
+PARTS = (0.01, 0.015, 0.02, 0.03, 0.035, 0.04, 0.05, 0.07, 0.1)
 # amplitudes by the rule of the metal for each radius (../three_metals): how they fall with it
 BY_RADIUS = {
     "W": {80: (1.31, 1.49, 1.75), 160: (0.92, 0.97, 1.23), 230: (0.69, 0.77, 1.03)},

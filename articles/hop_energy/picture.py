@@ -13,10 +13,11 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 from energies import METALS, ByGain, amplitude, folded, gain_line, map_of, measured_fold, projection_of, rings
-from predicted import PART
 
 import apt_evap as ae
 
+PART = 0.035
+"""Part of the gain along the surface."""
 TITLES = {"W": "tungsten [011]", "Ni": "nickel [111]"}
 
 
@@ -26,7 +27,7 @@ def rules_of(metal, hops, scale):
     mean = 0.12 * rule.probability.polarization * scale
     return {
         "the rule of the metal": rule,
-        f"{PART:g} G, atoms by G": ByGain(metal, gain_line(metal, hops), PART, scale, by_gain=True),
+        f"{PART:g} G along the surface": ByGain(metal, gain_line(metal, hops), PART, scale),
         "sharpness 0.1, half its energy": replace(rule, sharpness=0.1, energy=ae.TruncatedNormal(mean, mean)),
         "none rolls (F(T) at 150 K)": ae.LateralVelocity(rule.others),
     }
