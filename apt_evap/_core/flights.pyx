@@ -66,7 +66,7 @@ cdef double SCOUT_TOLERANCE = 3e-2
 
 # The field of distant sources is expanded about one ball for each part of a step, or about one for the whole step if
 # the balls of the parts are not smaller than SPLIT of it. FAR is the distance in radii of a ball from which sources are
-# expanded. Measured on Ni[111], R = 80 a, wide responses, 450 launches against direct sums: with 2.5 / 2.75 / 3 / 3.5,
+# expanded. Measured on Ni[111], R = 80 a, 119 launches of an ion, 450 launches against direct sums: with 2.5 / 2.75 / 3 / 3.5,
 # places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in 1.02 / 1.14 / 1.21
 # / 1.40 ms an ion.
 cdef double FAR = 3.0

@@ -291,12 +291,10 @@ class Explorer:
         return float(f"{max(self.bins_like(bins).bin_size):.2g}")
 
     def controls(self, mechanism: str) -> tuple[Control, ...]:
-        """Controls of a mechanism that this run permits: sharpness and height need wide responses."""
-        settings, controls = self.run.response_settings, controls_of(mechanism)
-        if not settings.is_wide:
-            return tuple(control for control in controls if control.name not in ("sharpness", "height"))
+        """Controls of a mechanism, with heights that this run permits."""
+        height = self.run.response_settings.height
         return tuple(
-            replace(control, high=settings.height) if control.name == "height" else control for control in controls
+            replace(control, high=height) if control.name == "height" else control for control in controls_of(mechanism)
         )
 
     @property

@@ -263,7 +263,6 @@ def _text(indexing, radii, size, lens, factors):
         'name = "ConstantPotential"',
         "",
         "[responses]",
-        "wide = true    # for ions that roll onto a mean of their neighbours",
         f"energy_limit = {limit:.2f}    # eV at the simulated voltage, {_VOLTAGE:g} V",
         "",
         "[flights]",

@@ -1,4 +1,4 @@
-"""Energy along the surface from the gain of the hop, beside other rules, on runs with wide responses.
+"""Energy along the surface from the gain of the hop, beside other rules, on runs with responses.
 
     python energies.py RUNS simulate Ni 80 --skip 30000 --ions 90000
     python energies.py RUNS judge Ni 80
@@ -88,7 +88,7 @@ class ByGain:
 
 
 def simulated(metal, radius, skip, ions, threads):
-    """Run with wide responses."""
+    """Run with responses."""
     axis, half_angle = AXES[metal]
     material = ae.material(metal)
     size = radius * material.a

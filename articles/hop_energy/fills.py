@@ -1,4 +1,4 @@
-"""What in the rule of a metal fills its poles: one number of it changed at a time, on a run with wide responses.
+"""What in the rule of a metal fills its poles: one number of it changed at a time, on a run with responses.
 
     python fills.py RUNS/Ni_80_wide.h5 --pole 1 1 1
 

@@ -1,4 +1,4 @@
-"""Lines and poles of a run with wide responses, with the interval that 10 % of the field of evaporation allows.
+"""Lines and poles of a run with responses, with the interval that 10 % of the field of evaporation allows.
 
     python predicted.py RUNS/Mg_80_wide.h5 --pole 0 0 0 1
 

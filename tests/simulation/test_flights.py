@@ -342,7 +342,7 @@ def test_the_field_of_a_group_against_direct_sums(scene, tip12):
 
 
 def test_a_bundle_lands_where_its_launches_do_alone(scene, tip12):
-    """The launches of wide responses, from places 0.3 nm apart, against exact sums for each alone."""
+    """The launches of responses, from places 0.3 nm apart, against exact sums for each alone."""
     atoms, charges, starts, _ = scene
     tree, random = Octree(atoms, charges), np.random.default_rng(8)
     starts = starts[1] + random.uniform(-0.12, 0.12, size=(60, 3)) + [0.0, 0.0, 0.1]
