@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "9ab4c31cd309fa4185299e41475db31ad6af0ee18429e64f79011b15110e6bb2"
+FINGERPRINT = "2d1b0221d31f10748cd424073f53907900687663960ef35896a61f0d4907ac3b"
 PROGRAM = """
 import warnings
 
