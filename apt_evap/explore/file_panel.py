@@ -4,8 +4,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from bokeh.models import AutocompleteInput
+from bokeh.models import AutocompleteInput, TextInput
 
+from apt_evap.explore.dropped_file import DROPPED
 from apt_evap.explore.search_process import start_thread
 from apt_evap.explore.start_page import files_to_open
 from apt_evap.explore.widgets import LEFT
@@ -48,6 +49,8 @@ class FilePanel:
             visible=read is not None,
         )
         self.field.on_change("value", lambda attr, old, new: self._named())
+        self.dropped = TextInput(visible=False, name=DROPPED)
+        self.dropped.on_change("value", lambda attr, old, new: new and self.open(new))
 
     def open(self, path: str) -> None:
         """Read a file in a thread, and make the page again; only what cannot be read leaves the page."""

@@ -14,7 +14,7 @@ from bokeh.util.token import generate_session_id
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import remember_file
-from apt_evap.explore.run_panel import ServerState
+from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.start_page import EXAMPLE, write_example
 from apt_evap.explore.upload import UploadHandler
 from apt_evap.maps.registration.register import Registration

@@ -349,8 +349,15 @@ def register(
 
     # the best of them refined with few pixels, then with many; those within the noise of the best one are ties
     bounds = rotations, scales, shift_bounds
-    known = (fit for fit in fits if not fewest or hits_on(simulated, measured, fit.transform) >= fewest)
-    fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(known, _MAX_FITS)]
+
+    def shown(fit):
+        return not fewest or hits_on(simulated, measured, fit.transform) >= fewest
+
+    fits = [
+        refine(simulated, measured, fit.transform, MEDIUM, least, *bounds)
+        for fit in distinct(filter(shown, fits), _MAX_FITS)
+    ]
+    fits = [*filter(shown, fits)]
     if not fits:
         raise ValueError(
             f"the measured map must show at least {fewest:.0f} of the simulated hits, which no registration does: "
@@ -664,7 +671,7 @@ def _fewest_hits(simulated):
 
 
 def _default_scales(simulated, fewest, ratio):
-    """Scales of the search: at the largest one the measured map shows the fewest hits, with twice their mean density."""
+    """Scales of the search; at the largest one the measured map shows the fewest hits, at twice their mean density."""
     shown = simulated.map.values[simulated.mask].sum() / fewest if fewest else np.inf
     return np.sqrt(0.5) * ratio, min(5, np.sqrt(2 * shown)) * ratio
 
