@@ -115,15 +115,14 @@ class RunPanel:
         def work():
             made = self._settings(minutes, thread_count())
             made.save(path)
-            self._later(partial(self._written, f"wrote {path}: {made.cost}", made, path), 0)
+            self._later(partial(self._written, f"wrote {path}: {made.cost}", made), 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 
-    def _written(self, text, made=None, path=None):
+    def _written(self, text, made=None):
         self.write.disabled = False
         self._show(text)
         if made is not None:
-            self._state.registration_options[str(path.with_suffix(".h5"))] = made.registration
             self._put_code(made.text)
 
     def _simulate_or_stop(self):
@@ -157,7 +156,7 @@ class RunPanel:
     def _made(self, made, path):
         self.simulate.disabled = False
         self.file.value = str(path)
-        self._written(f"wrote {path}: {made.cost}", made, path)
+        self._written(f"wrote {path}: {made.cost}", made)
         self._state.doubt = "" if made.indexing.decided else "not decided: this is the first candidate; "
         self._start_or_stop()
 

@@ -21,8 +21,6 @@ class ServerState:
         """The run in the background."""
         self.doubt = ""
         """What is not sure about the settings of the run, for the page."""
-        self.registration_options: dict[str, dict[str, Any]] = {}
-        """Options of `register` for the files of runs."""
         self.indexed: dict[str, dict[str, Any]] = {}
         """What `IndexPanel` keeps, for the files of measurements."""
 

@@ -108,8 +108,6 @@ def serve(
         remember_file(path)
         if before is not None and shown[0] is not None and shown[0].names[1] != path:
             shown[0].keep_ions(before)
-        if shown[0] is not None:
-            shown[0].registration_options = state.registration_options.get(path, {})
 
         def make_again():
             document.clear()
