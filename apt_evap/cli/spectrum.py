@@ -73,7 +73,7 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, f"for other commands: --distance {fit.distance:.2f} --t0 {fit.time_zero:.2f}")
     counts = {} if ranges is None else {name: len(ranges.select(result.hits, name)) for name in ranges.species_names}
     for name, number in counts.items():
-        tell(options, f"{name}: {number:,} ions in its ranges of {ranges.source!r}")
+        tell(options, f"{name}: {number:,} ions in its ranges")
     if saved is not None:
         write_rrng(saved, result.ranges)
         tell(options, f"wrote {saved}")

@@ -50,7 +50,7 @@ class FilePanel:
         )
         self.field.on_change("value", lambda attr, old, new: self._named())
         self.dropped = TextInput(visible=False, name=DROPPED)
-        self.dropped.on_change("value", lambda attr, old, new: new and self.open(new))
+        self.dropped.on_change("value", lambda attr, old, new: self._open_dropped(new))
 
     def open(self, path: str) -> None:
         """Read a file in a thread, and make the page again; only what cannot be read leaves the page."""
@@ -68,6 +68,10 @@ class FilePanel:
             self._later(make_again, 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._note, sentence), 0))
+
+    def _open_dropped(self, path):
+        if path:  # "" comes before the same path again
+            self.open(path)
 
     def _named(self):
         if self._read is not None and (path := self.field.value.strip()):

@@ -118,7 +118,7 @@ class Page:
     def close(self) -> None:
         """End what runs in the background."""
         self._tasks.close()
-        for panel in (self.registration, self.index, self.simulation, self.start and self.start.progress):
+        for panel in (self.registration, self.index, self.simulation, self.start):
             if panel is not None:
                 panel.close()
 

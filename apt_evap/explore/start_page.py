@@ -59,9 +59,9 @@ class StartPage:
     ) -> None:
         self._open = open_file
         self.stop = Button(width=120, visible=False)
-        self.stop.on_click(lambda: self.progress.stop())
         self.text = Div(sizing_mode="stretch_width", margin=0)
         self.progress = RunProgress(state, self.text, {self.stop: ""}, later, open_file)
+        self.stop.on_click(self.progress.stop)
         self.zone = Div(
             text="Drop a measured file or a run here", sizing_mode="stretch_width", name=TOLD,
             stylesheets=[InlineStyleSheet(css=_DROP_STYLE)],
@@ -102,6 +102,10 @@ class StartPage:
         text = f"{more} more: type their names above" if more > 0 else "" if rows else empty
         head = Div(text=f"<b>{title}</b>", styles={"font-size": "15px"})
         return column(head, *rows, *([Div(text=f"<small>{text}</small>")] if text else []))
+
+    def close(self) -> None:
+        """Show the run no longer; it goes on."""
+        self.progress.close()
 
     def _run(self, path):
         """Run a settings file; its run is opened at its end."""
