@@ -311,7 +311,7 @@ class Explorer:
     ) -> Registration:
         """Register the run on the measurement: the best of several emissions. Returns `registration`.
 
-        It is set at each emission that is better than those before.
+        It is set at each emission that is better than those before and not doubtful, and at the end.
 
         Parameters
         ----------
@@ -356,9 +356,11 @@ class Explorer:
             progress(done, len(perturbations))
             if registration is not None and (best is None or registration.score > best.score):
                 best = registration
-                self.set_registration(best)
+                if not best.doubtful:
+                    self.set_registration(best)
         if best is None:
             raise failed
+        self.set_registration(best)
         best.warn_if_doubtful()
         return best
 
