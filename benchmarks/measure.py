@@ -158,7 +158,7 @@ def evaporate(emitter, events):
 
 
 def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0):
-    """Time of an event, ions per second with one flight, with both responses and with wide ones, peak memory."""
+    """Time of an event, ions per second with one flight and with responses, peak memory."""
     rows = []
     for radius in radii:
         for n_threads in threads:
@@ -166,15 +166,11 @@ def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0)
             simulation = ae.Simulation(nickel_tip(radius, shank, depth), seed=1, n_threads=n_threads)
             set_up = time.perf_counter() - start
             events, relaxations = evaporate(simulation.emitter, ions)
-            wide = ae.Simulation(
-                simulation.tip, seed=1, n_threads=n_threads, response_settings=ae.ResponseSettings.wide()
-            )
             speeds = []
-            for each, responses in ((simulation, False), (simulation, True), (wide, True)):
+            for responses in (False, True):
                 start = time.perf_counter()
-                each.run(ions, responses=responses, progress=False)
+                simulation.run(ions, responses=responses, progress=False)
                 speeds.append(ions / (time.perf_counter() - start))
-            del wide
             constant = Emitter(simulation.tip, rule=ae.ConstantPotential(), n_threads=n_threads)
             constant_potential = sum(evaporate(constant, ions))
             del constant
@@ -187,8 +183,7 @@ def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0)
                     "event [us]": events / ions * 1e6,
                     "relaxation, per event [us]": relaxations / ions * 1e6,
                     "ions/s, one flight": speeds[0],
-                    "ions/s, both responses": speeds[1],
-                    "ions/s, wide responses": speeds[2],
+                    "ions/s, responses": speeds[1],
                     "event and relaxation, constant potential [us]": constant_potential / ions * 1e6,
                     "peak memory [GB]": peak_memory(),
                 }

@@ -30,7 +30,7 @@ tip = ae.Tip(nickel, **shape, depth=4 * nickel.a)
 print(tip)
 
 # %%
-# The time of an event hardly depends on the size of the tip. Responses need 30 flights per ion. If only one
+# The time of an event hardly depends on the size of the tip. Responses need 140 flights per ion. If only one
 # perturbation is needed, one flight per ion is faster. For a run of hours, ``checkpoint="large.h5"`` saves the ions at
 # intervals, and the run can be resumed.
 

@@ -6,8 +6,8 @@ import apt_evap as ae
 ROUGH = {
     "flight_settings": ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2),
     "response_settings": ae.ResponseSettings(
-        site=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),
-        rolled=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),
+        site=ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 6)), 8),
+        rolled=ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 6)), 20, place=True),
         bound=1.0,
     ),
 }

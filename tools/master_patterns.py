@@ -42,7 +42,6 @@ def simulated(element, radius, skip, ions, seed):
         tip,
         seed=seed,
         rule=ae.ConstantPotential(law_field="others"),
-        response_settings=ae.ResponseSettings.wide(),
         detector=ae.Detector(distance=100.0, width=500.0, projection="equidistant"),
     )
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()

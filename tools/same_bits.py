@@ -4,7 +4,7 @@
     python tools/same_bits.py BASE --times 5     the same, and pairs of timed runs
 
 The runs: Ni[111], R = 20 a, with responses; two phases at a temperature with a controlled voltage; a constant
-potential with wide responses; a random alloy with a user-defined perturbation; a shell with R = 60 a that
+potential with responses; a random alloy with a user-defined perturbation; a shell with R = 60 a that
 is deepened. Compared are `Run.fingerprint`, and the hits of the ions: unperturbed and rolled up. The exit code is 1 if
 one differs.
 """
@@ -63,7 +63,7 @@ def simulation(name):
     if name == "potential":
         tip = ae.Tip(nickel, apex_radius=12 * a, axis=(1, 1, 1))
         rule = ae.ConstantPotential(charges="gaussian", law_field="charge")
-        return ae.Simulation(tip, seed=5, rule=rule, response_settings=ae.ResponseSettings.wide()), 1500, ()
+        return ae.Simulation(tip, seed=5, rule=rule), 1500, ()
     if name == "alloy":
         radius = 12 * aluminium.a
         tip = ae.Tip(aluminium, apex_radius=radius, axis=(0, 1, 2), solutes={"Ni": 0.05}, seed=3, offset_seed=5)

@@ -14,7 +14,7 @@ kind=${1:?"must be address, bounds, thread or valgrind"}
 shift
 tests=("$@")
 core=(tests/_core tests/simulation/test_flights.py tests/simulation/test_response.py
-      tests/simulation/test_wide_responses.py tests/simulation/test_field_of_view.py)
+      tests/simulation/test_rules_by_response.py tests/simulation/test_field_of_view.py)
 build=$PWD/build/$kind
 log=$build/findings
 mkdir -p "$build"

@@ -22,7 +22,8 @@ from numpy.typing import DTypeLike, NDArray
 from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
 
-_FORMAT = "apt_evap {} 1"
+_PROGRAM = "apt_evap "
+_FORMATS = {"run": 2}  # numbers of the formats of kinds of content that are not 1
 _CHUNK = 1 << 20  # bytes; HDF5 keeps chunks up to this size while rows of them are read
 _DEFLATED = 1032  # largest ratio of deflate: 258 bytes in 2 bits (zlib.net/zlib_tech.html)
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -34,7 +35,7 @@ class Label(NamedTuple):
     """Label of the content of a file, in its first header."""
 
     kind: str
-    """Kind of content, such as "run"."""
+    """Kind of content, such as "run"; of another version of it "run of format 1"."""
     rows: int
     """Number of rows."""
     note: str
@@ -90,8 +91,9 @@ def write_hdf5(path: AnyPath, kind: str, rows: int, note: str = "") -> Iterator[
     with replace_file(path) as target:
         sink = _Sink(target)
         try:
+            label = f"{_PROGRAM}{kind} {_FORMATS.get(kind, 1)}"
             with h5py.File(sink, "w", libver=("v110", "v110")) as file:
-                for name, text in (("format", _FORMAT.format(kind)), ("note", note)):
+                for name, text in (("format", label), ("note", note)):
                     file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", max(1, len(text.encode()))))
                 file.attrs["rows"] = rows
                 yield file
@@ -210,8 +212,9 @@ class CheckedFile:
         kind, rows, note = (self.attribute(name) for name in ("format", "rows", "note"))
         if not (isinstance(kind, bytes) and isinstance(rows, np.integer) and isinstance(note, bytes)):
             return None
-        before, _, after = _FORMAT.partition("{}")
-        kind = kind.decode(errors="replace").removeprefix(before).removesuffix(after)
+        kind, _, number = kind.decode(errors="replace").removeprefix(_PROGRAM).rpartition(" ")
+        if number != str(_FORMATS.get(kind, 1)):
+            kind = f"{kind} of format {number}"
         return Label(kind, int(rows), note.decode(errors="replace"))
 
     def __contains__(self, path: str) -> bool:

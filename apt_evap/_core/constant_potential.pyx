@@ -39,6 +39,7 @@ cdef extern from "kernels.h":
                          const float*, const float*, float*) noexcept nogil
     void patch_potential_and_field(Index, const float*, const float*, const float*, Index, const float*, const float*,
                                    const float*, const float*, float*, float*, float*, float*) noexcept nogil
+    void patch_product(Index, Index, const float*, const float*, float*) noexcept nogil
     float patch_dot(Index, const float*, const float*) noexcept nogil
 
 
@@ -480,7 +481,6 @@ cdef class ConstantPotential(FieldRule):
             residual[i] = 0.0
         for i in range(stride):
             direction[i] = residual[i]
-            image[i] = 0.0
 
         # conjugate gradients: step along a direction d by r.r / d.A d, next direction r + d (r.r) / (previous r.r)
         bound = <float>(self.tolerance * self.self_term * mean)
@@ -491,8 +491,7 @@ cdef class ConstantPotential(FieldRule):
                 largest = max(largest, fabsf(residual[i]))
             if largest <= bound:
                 break
-            for i in range(n):
-                image[i] = patch_dot(stride, &self.matrix[i * stride], direction)
+            patch_product(n, stride, &self.matrix[0], direction, image)   # the matrix is symmetric
             curvature = patch_dot(stride, direction, image)
             if not curvature > 0.0:
                 with gil:

@@ -109,16 +109,41 @@ APT_CLONES static void polynomial_field(int degree, const float *restrict coeffi
  * of a dot product wait for each other. */
 #define PATCH_LANES 64
 
-/* One row of the Robin matrix: row[k] = n . (p - r_k)/|p - r_k|^3 for the atom at p with normal n. */
-APT_CLONES static void patch_row(Index n, const float *restrict x, const float *restrict y, const float *restrict z,
-                                 float px, float py, float pz, const double *normal, float *restrict row)
+/* One column of the Robin matrix: column[k] = factor n_k . (r_k - p)/|r_k - p|^3 for the atom at p, with the normals n. */
+APT_CLONES static void patch_column(Index n, const float *restrict x, const float *restrict y, const float *restrict z,
+                                    const float *restrict nx, const float *restrict ny, const float *restrict nz,
+                                    float px, float py, float pz, float factor, float *restrict column)
 {
-    const float nx = (float)normal[0], ny = (float)normal[1], nz = (float)normal[2];
 #pragma omp simd
     for (Index k = 0; k < n; k++) {
-        const float dx = px - x[k], dy = py - y[k], dz = pz - z[k];
+        const float dx = x[k] - px, dy = y[k] - py, dz = z[k] - pz;
         const float s = dx * dx + dy * dy + dz * dz;
-        row[k] = s > (float)SAME_PLACE ? (nx * dx + ny * dy + nz * dz) / (s * sqrtf(s)) : 0.0f;
+        column[k] = s > (float)SAME_PLACE ? factor * (nx[k] * dx + ny[k] * dy + nz[k] * dz) / (s * sqrtf(s)) : 0.0f;
+    }
+}
+
+/* sums[k] += factor column[k]. */
+APT_CLONES static void patch_add(Index n, float factor, const float *restrict column, float *restrict sums)
+{
+#pragma omp simd
+    for (Index k = 0; k < n; k++)
+        sums[k] += factor * column[k];
+}
+
+/* Product of n columns of `stride` numbers with the numbers a: no sums over lanes, which take as long as the products. */
+APT_CLONES static void patch_product(Index n, Index stride, const float *restrict columns, const float *restrict a,
+                                     float *restrict product)
+{
+    for (Index first = 0; first < stride; first += PATCH_LANES) {
+        float sum[PATCH_LANES] = {0};
+        for (Index k = 0; k < n; k++) {
+            const float *restrict column = columns + k * stride + first;
+            const float factor = a[k];
+#pragma omp simd
+            for (int l = 0; l < PATCH_LANES; l++)
+                sum[l] += factor * column[l];
+        }
+        memcpy(product + first, sum, sizeof sum);
     }
 }
 

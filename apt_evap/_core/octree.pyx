@@ -262,14 +262,14 @@ cdef class Octree:
                     self.dirty[node] = 0
             self.n_dirty = 0
             return
-        for i in range(1, self.n_dirty):
+        for i in range(1, self.n_dirty):   # changes come in the order of the tree: nearly sorted
             node = self.queue[i]
             j = i - 1
-            while j >= 0 and self.queue[j] < node:
+            while j >= 0 and self.queue[j] > node:
                 self.queue[j + 1] = self.queue[j]
                 j -= 1
             self.queue[j + 1] = node
-        for i in range(self.n_dirty):
+        for i in range(self.n_dirty - 1, -1, -1):
             self.moments(self.queue[i])
             self.dirty[self.queue[i]] = 0
         self.n_dirty = 0

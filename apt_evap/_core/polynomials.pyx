@@ -29,6 +29,12 @@ cdef void fill(const signed char[:, ::1] exponents, const double* variables, dou
             monomial[c] *= power[v * (MAX_DEGREE + 1) + exponents[c, v]]
 
 
+cdef void add_scaled(Index n, double factor, const double* values, double* totals) noexcept nogil:
+    cdef Index c
+    for c in range(n):
+        totals[c] += values[c] * factor
+
+
 def _check(exponents):
     if exponents.shape[0] > MAX_MONOMIALS or not 1 <= exponents.shape[1] <= MAX_VARIABLES \
             or np.min(exponents) < 0 or np.max(exponents) > MAX_DEGREE:
@@ -63,17 +69,16 @@ def fit(const double[:, ::1] inverse, const double[:, :, ::1] values):
     -------
     ndarray, shape (n, 3, c)
     """
-    cdef Index i, j, k, c, n = values.shape[0], m = values.shape[1]
-    cdef double total
-    cdef double[:, :, ::1] coefficients = np.empty((n, 3, inverse.shape[0]))
-    with nogil:
-        for i in range(n):
-            for k in range(3):
-                for c in range(inverse.shape[0]):
-                    total = 0.0
-                    for j in range(m):
-                        total += inverse[c, j] * values[i, j, k]
-                    coefficients[i, k, c] = total
+    cdef Index i, j, k, n = values.shape[0], m = values.shape[1], n_monomials = inverse.shape[0]
+    # the innermost loop is over the coefficients: each has its sum in the order of the launches
+    cdef double[:, ::1] columns = np.ascontiguousarray(np.asarray(inverse).T)
+    cdef double[:, :, ::1] coefficients = np.zeros((n, 3, n_monomials))
+    if n and m and n_monomials:
+        with nogil:
+            for i in range(n):
+                for j in range(m):
+                    for k in range(3):
+                        add_scaled(n_monomials, values[i, j, k], &columns[j, 0], &coefficients[i, k, 0])
     return np.asarray(coefficients)
 
 
@@ -89,20 +94,22 @@ def misfits(const double[:, ::1] matrix, const double[:, :, ::1] coefficients, c
     values : ndarray, shape (n, m, 3)
         Results of the launches.
     """
-    cdef Index i, j, k, c
-    cdef double total, squares
-    cdef double[::1] sums = np.empty(values.shape[0])
-    with nogil:
-        for i in range(values.shape[0]):
-            squares = 0.0
-            for j in range(matrix.shape[0]):
+    cdef Index i, j, k, c, n = values.shape[0], m = matrix.shape[0]
+    cdef double total
+    cdef double[:, ::1] columns = np.ascontiguousarray(np.asarray(matrix).T)
+    cdef double[:, ::1] fitted = np.empty((2, m))
+    cdef double[::1] sums = np.zeros(n)
+    if n and m:
+        with nogil:
+            for i in range(n):
+                fitted[:, :] = 0.0
                 for k in range(2):
-                    total = 0.0
                     for c in range(matrix.shape[1]):
-                        total += matrix[j, c] * coefficients[i, k, c]
-                    total -= values[i, j, k]
-                    squares += total * total
-            sums[i] = squares
+                        add_scaled(m, coefficients[i, k, c], &columns[c, 0], &fitted[k, 0])
+                for j in range(m):
+                    for k in range(2):
+                        total = fitted[k, j] - values[i, j, k]
+                        sums[i] += total * total
     return np.asarray(sums)
 
 

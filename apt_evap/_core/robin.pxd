@@ -17,7 +17,7 @@ cdef class Robin(FieldRule):
     cdef double potential               # of the specimen at the last relaxation [e/nm]
     cdef double clearance               # initial distance of this point from the surface [nm]
     cdef double far_scale               # factor of the charges far from the holes since the whole surface was solved
-    cdef float[::1] matrix, residual
+    cdef float[::1] matrix, columns
 
     cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists)
     cdef scale_others(self, Octree tree, InteractionLists lists, ratios)

@@ -18,9 +18,9 @@ from apt_evap._core.interactions cimport InteractionLists
 
 
 cdef extern from "kernels.h":
-    void patch_row(Index, const float*, const float*, const float*, float, float, float, const double*,
-                   float*) noexcept nogil
-    float patch_dot(Index, const float*, const float*) noexcept nogil
+    void patch_column(Index, const float*, const float*, const float*, const float*, const float*, const float*,
+                      float, float, float, float, float*) noexcept nogil
+    void patch_add(Index, float, const float*, float*) noexcept nogil
 
 
 OUTLIER = 4.0
@@ -333,41 +333,46 @@ cdef class Robin(FieldRule):
         self.drift = 0.0
 
     cdef int grow(self, Index stride) except -1 nogil:
-        if stride > self.residual.shape[0]:
+        if 4 * stride > self.columns.shape[0]:
             with gil:
                 self.matrix = np.zeros(stride * stride, np.float32)
-                self.residual = np.zeros(stride, np.float32)
+                self.columns = np.zeros(4 * stride, np.float32)
         return 0
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
         # Gauss-Seidel iteration of the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old
-        # charges.
+        # charges. A new x_i changes all right sides by a column of the matrix.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
-        cdef float new, largest
-        cdef Index i, slot
-        cdef int _iteration
-        self.grow(patch.stride)
+        cdef float step, largest = 0.0
+        cdef Index i, slot, n = patch.n, stride = patch.stride
+        cdef int _iteration, axis
+        self.grow(stride)
+        cdef float* right = &self.columns[0]
+        cdef float* normal = &self.columns[stride]
 
-        # residuals r_i = (s/2 pi) E_i . n_i - q_i of the old charges, and rows K_i of the matrix
-        for i in range(patch.n):
+        # residuals r_i = (s/2 pi) E_i . n_i - q_i of the old charges, normals, and columns of the matrix
+        for i in range(n):
             slot = patch.slot[i]
-            mean += tree.q[slot] / patch.n
-            patch_row(patch.stride, patch.x, patch.y, patch.z, patch.x[i], patch.y[i], patch.z[i], &normals[slot, 0],
-                      &self.matrix[i * patch.stride])
-            self.residual[i] = <float>(c * (
-                normals[slot, 0] * self.field[slot, 0] + normals[slot, 1] * self.field[slot, 1]
-                + normals[slot, 2] * self.field[slot, 2]) - tree.q[slot])
-            patch.change[i] = self.residual[i]
+            mean += tree.q[slot] / n
+            right[i] = <float>(c * self.along(normals, slot) - tree.q[slot])
+            patch.change[i] = 0.0
+            for axis in range(3):
+                normal[axis * stride + i] = <float>normals[slot, axis]
+        for i in range(n, stride):
+            right[i] = normal[i] = normal[stride + i] = normal[2 * stride + i] = 0.0
+        for i in range(n):
+            patch_column(stride, patch.x, patch.y, patch.z, normal, normal + stride, normal + 2 * stride, patch.x[i],
+                         patch.y[i], patch.z[i], <float>c, &self.matrix[i * stride])
         for _iteration in range(60):
             largest = 0.0
-            for i in range(patch.n):
-                new = self.residual[i] + <float>c * patch_dot(
-                    patch.stride, &self.matrix[i * patch.stride], patch.change)
-                largest = max(largest, fabsf(new - patch.change[i]))
-                patch.change[i] = new
+            for i in range(n):
+                step = right[i] - patch.change[i]
+                largest = max(largest, fabsf(step))
+                patch.change[i] = right[i]
+                patch_add(stride, step, &self.matrix[i * stride], right)
             if largest <= self.tolerance * mean:
                 break
-        for i in range(patch.n):
+        for i in range(n):
             patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
         patch.unsettled = largest > self.tolerance * mean
         return 0

@@ -17,7 +17,8 @@ from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.measured_ions import NUMBERED, IonSelection, MeasuredIons
-from apt_evap.fit.start_settings import is_start
+from apt_evap.fit.fit_energies import measured_map
+from apt_evap.fit.start_settings import is_start, registration_start_of
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
@@ -94,6 +95,8 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     )
     if options.element is not None and (name := read_material(options.element, "--element").name) in MATERIALS:
         explorer.crystal = name
+    if explorer.is_comparison:
+        explorer.registration_options = _place(options.run, measured)
     start = explorer.start
     bins = options.bins or start.bins
     view = ExplorerSettings(
@@ -106,11 +109,19 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     return explorer, view
 
 
-def _recommended(path):
-    """Emission of the settings of a run that were made from a measured map and lie beside it; None without them."""
+def _settings_beside(path):
+    """Settings of a run that were made from a measured map and lie beside it; None without them."""
     settings = None if path is None else Path(path).with_suffix(".toml")
     try:
-        if settings is None or not settings.is_file() or not is_start(settings):
+        return settings if settings is not None and settings.is_file() and is_start(settings) else None
+    except (ValueError, OSError):
+        return None
+
+
+def _recommended(path):
+    """Emission of the settings of a run that were made from a measured map; None without them."""
+    try:
+        if (settings := _settings_beside(path)) is None:
             return None
         for panel in read_config(settings).maps.panels:
             if not isinstance(panel.perturbation, Unperturbed):
@@ -118,7 +129,16 @@ def _recommended(path):
                 return panel.perturbation
     except (ValueError, OSError):  # changed by hand: the run is shown without it
         return None
-    return None
+
+
+def _place(path, measured):
+    """Where the run lies on the measurement that its settings were made from, for `register`; {} if it is not known."""
+    try:
+        if (settings := _settings_beside(path)) is not None:
+            return registration_start_of(settings, measured_map(measured))
+    except (ValueError, OSError, IndexError):  # changed by hand
+        pass
+    return {}
 
 
 def _ions(options, explorer):

@@ -14,12 +14,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Draw the mass spectrum of measured ions with its background, and name its peaks: of the elements\n"
         "that are given, or of the most probable ones. Flight length and time zero are fitted to the peaks if\n"
-        "the file has times of flight and no masses."
+        "the file has times of flight and no masses. With --ranges, the ranges of a file are drawn over it."
     )
     parser.epilog = (
         "example:\n"
         "  apt-evap spectrum R5083.epos\n"
         "  apt-evap spectrum R5083.epos --element Cr,CrO,Si --save R5083.rrng\n"
+        "  apt-evap spectrum R5083.epos --ranges R5083.rrng\n"
         "  apt-evap spectrum W_tap.raw --element W --distance 305"
     )
     parser.add_argument("file", metavar="FILE", help="measured ions (.epos, .pos, .raw, ...)")
@@ -45,6 +46,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.cli._files import read, select
     from apt_evap.detection.hits import Hits
     from apt_evap.detection.mass_spectrum import spectrum
+    from apt_evap.io.formats import read_ranges
     from apt_evap.io.rrng import write_rrng
     from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
@@ -57,22 +59,28 @@ def execute(options: argparse.Namespace) -> int:
         check_output(saved, lambda path: False, options.force)
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
+    ranges, options.ranges = None if options.ranges is None else read_ranges(options.ranges), None
     hits = read(options)
     if not isinstance(hits, Hits):
         raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
+    if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
+        raise ValueError(f"--distance is missing: {options.file!r} has no masses, and times of flight need it [mm]")
     elements = None if options.element is None else options.element.split(",")
     result = spectrum(select(hits, options), elements, distance=options.distance, time_zero=options.time_zero)
     tell(options, f"{result}")
     if result.flight is not None and result.flight.peaks:
         fit = result.flight
         tell(options, f"for other commands: --distance {fit.distance:.2f} --t0 {fit.time_zero:.2f}")
+    counts = {} if ranges is None else {name: len(ranges.select(result.hits, name)) for name in ranges.species_names}
+    for name, number in counts.items():
+        tell(options, f"{name}: {number:,} ions in its ranges")
     if saved is not None:
         write_rrng(saved, result.ranges)
         tell(options, f"wrote {saved}")
-    save_figure(picture, plot.spectrum(result, bin_width=_BIN).figure)
+    save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure)
     tell(options, f"wrote {picture}")
     summary = {"wrote": str(picture), "file": options.file, "ranges": None if saved is None else str(saved)}
     names = ("name", "ions", "background", "fill", "intervals")
     peaks = [{name: getattr(peak, name) for name in names} for peak in result.peaks]
-    tell_json(options, summary | {"peaks": peaks})
+    tell_json(options, summary | {"peaks": peaks} | ({} if ranges is None else {"ions_in_ranges": counts}))
     return 0

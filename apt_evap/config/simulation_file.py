@@ -344,7 +344,7 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
     with _located(path, "rule"):
         check_rule(objects["rule"])
     with _located(path, "responses"):
-        response_settings = ResponseSettings.of_table(document.get("responses", {}))
+        response_settings = from_plain(document.get("responses", {}), ResponseSettings, what="responses")
     with _located(path, "real_units"):
         real_units = None
         if "real_units" in document:

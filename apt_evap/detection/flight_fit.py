@@ -102,10 +102,16 @@ class FlightFit:
         )
         target = np.append(shift / error, np.zeros(len(names)))
         for unknowns in (design.shape[1], design.shape[1] - 1):  # first with the time, then without
-            covariance = np.linalg.inv(design[:, :unknowns].T @ design[:, :unknowns])
-            step = covariance @ design[:, :unknowns].T @ target
-            errors = np.sqrt(np.diag(covariance))
             with_time = unknowns == design.shape[1]
+            try:
+                covariance = np.linalg.inv(design[:, :unknowns].T @ design[:, :unknowns])
+            except np.linalg.LinAlgError:
+                if with_time:
+                    continue
+                return self
+            step = covariance @ design[:, :unknowns].T @ target
+            with np.errstate(invalid="ignore"):  # a variance below 0, by rounding, is that of a time that is not known
+                errors = np.sqrt(np.diag(covariance))
             if not with_time or errors[-1] * of_time.max() / 2 < _BROADEST:
                 break
         return FlightFit(

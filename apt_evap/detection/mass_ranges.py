@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
-from apt_evap._common.validation import check_array, check_kind, check_sequence, did_you_mean, short_text
+from apt_evap._common.validation import check_array, check_kind, check_name, check_sequence, did_you_mean, short_text
 from apt_evap.detection.hits import Hits
 from apt_evap.warnings import DataWarning, warn
 
@@ -54,18 +54,23 @@ class Ranges:
         check_kind(self.source, "source", str, "text")
         names = check_sequence(self.names, "names", "names of species")
         for name in names:
-            check_kind(name, "names", str, "names of species")
+            check_name(name, "names of species")
         n = len(names)
         if n == 0:
             raise ValueError(f"{self.source or 'Ranges'} must have at least one range, got none")
         low, high = (check_array(getattr(self, name), name, (n,)) for name in ("low", "high"))
         volume = np.full(n, np.nan) if self.volume is None else check_array(self.volume, "volume", (n,), finite=False)
         colour = ("",) * n if self.colour is None else check_sequence(self.colour, "colour", "colours")
+        for text in colour:
+            if text != "":
+                check_name(text, "colour")
         composition = ({},) * n
         if self.composition is not None:
             composition = check_sequence(self.composition, "composition", "mappings of an element to its atoms")
             for atoms in composition:
                 check_kind(atoms, "composition", Mapping, "mappings of an element to its atoms")
+                for element in atoms:
+                    check_name(element, "elements of a composition")
             composition = tuple(dict(atoms) for atoms in composition)
         for name, values in (("colour", colour), ("composition", composition)):
             if len(values) != n:

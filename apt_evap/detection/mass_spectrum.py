@@ -28,12 +28,15 @@ FEWEST_OF_ELEMENT = 4000
 _MOLECULES = ("H2", "OH", "H2O", "N2", "O2", "CO")  # of the residual gas
 _HIGHEST_CHARGES = ((85.0, 2), (170.0, 3), (math.inf, 4))  # mass [Da] below which ions have at most this charge
 _EXPECTED = 3  # charge that every expected ion may have
-_FILE, _FLIGHT, _FITTED = 0.01, 0.1, 0.006  # of the factor on m/n: of a file, of nominal lengths, of a fit
+# of the factor on m/n: of a file, of a nominal length, with the first ion of a fit, with a fit
+_FILE, _FLIGHT, _BEGUN, _FITTED = 0.01, 0.1, 0.02, 0.006
 _BETTER = 1.1  # ions that a rival explains over those of a comb that it displaces
 _ALIKE = 0.85  # ions that a rival explains over those of a comb, from which it is named, too
 _LEAST = 5e-4  # of all ions: smaller combs have no name
 _MOST = 15  # ions with a name
 _STEPS = 4  # of the fit of the flight
+_STARTS = 3  # ions of a kind that the fit may start with
+_WELL_NAMED = 0.97  # part of the ions above the background that are explained: no other start is tried
 _PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
 
 
@@ -244,20 +247,68 @@ def _detected(hits):
 
 
 def _fitted(hits, flight, formulas):
-    """Flight length and time zero after some steps of the fit."""
+    """Flight length and time zero after some steps of the fit: from the first ions, or from others that explain more.
+
+    A few expected ions may fit the peaks of others: Al2+ and Al+ those of Si2+ and N2+, 4 % beside them. The peaks that
+    then have no name of any ion show it.
+    """
     flight = flight.sharpened(hits)
-    chosen = formulas
+    counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
+    best, most = flight, -math.inf
+    for start in _starts(counts, formulas):
+        fit = _fitted_from(hits, flight, start, formulas)
+        part = _named_part(hits, fit, formulas)
+        # a nominal length is good to some per cent
+        score = part - abs(math.log(fit.distance / flight.distance))
+        if score > most:
+            best, most = fit, score
+        if formulas is None or part > _WELL_NAMED:
+            break
+    return best
+
+
+def _starts(counts, formulas):
+    """Ions that a fit may start with: expected ones, each without the peaks of those before, then any."""
+    for known in (formulas, None):
+        rest = counts
+        for _ in range(_STARTS):
+            start = next(_candidates(rest, known, _FLIGHT), None)
+            if start is None:
+                break
+            yield start[0]
+            rest = rest.without(start[0].intervals)
+        if formulas is None:
+            return
+
+
+def _fitted_from(hits, flight, comb, formulas):
+    """The fit that starts with the peaks of one ion."""
+    combs, nominal = [comb], flight.distance
+    chosen = [*(formulas or ["H"]), comb.formula]
     for step in range(_STEPS):
-        counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
-        # the first comb gives the factor of the others
-        combs = [comb for comb, _ in _combs(counts, chosen, _FITTED if step > 1 else _FLIGHT)]
+        if step:
+            counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
+            # the first comb gives the factor of the others
+            combs = [comb for comb, _ in _combs(counts, chosen, _FITTED if step > 1 else _BEGUN)]
         if not combs:
             return flight
-        if step == 0:
-            combs = combs[:1]
-            chosen = formulas or [combs[0].formula, "H"]
-        flight = flight.improved(hits, combs)
+        better = flight.improved(hits, combs)
+        if not abs(better.distance / nominal - 1.0) < _FLIGHT:  # it leads away from the spectrum
+            return flight
+        flight = better
     return flight
+
+
+def _named_part(hits, flight, formulas):
+    """Part of the ions above the background that ions with a name explain."""
+    rest = counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
+    explained = 0.0
+    for known in (None,) if formulas is None else (formulas, None):
+        for comb, _ in _combs(rest, known, _FITTED):
+            rest = rest.without(comb.intervals)
+            explained += comb.ions * comb.fill
+    above = float((counts.counts - counts.background).sum())
+    return explained / above if above > 0 else 0.0
 
 
 def _combs(counts, formulas, tolerance):

@@ -99,7 +99,7 @@ class TangentialPerturbation(Perturbation, Protocol):
         ...
 
 
-_HEIGHT = "Height of the start above the site, of a rolled ion above p_r. Above 0 it needs `ResponseSettings.wide`."
+_HEIGHT = "Height of the start above the site, of a rolled ion above p_r."
 
 
 def _probability(probability, name):
@@ -160,7 +160,7 @@ class _Rolling(_Tangential):
     )
     sharpness: float = number(
         "0: s is the neighbour of highest charge. Above 0: s is a mean of the three strongest ones with the weights of "
-        "`target_shares`; this needs wide responses (`ResponseSettings.wide`).",
+        "`target_shares`.",
         default=0.0,
         at_least=0,
         at_most=100,
@@ -290,7 +290,7 @@ class RollUp(_Rolling, _Energetic):
         Returns
         -------
         RollUp
-            For runs with ``rule=ConstantPotential()`` and `ResponseSettings.wide()`.
+            For runs with ``rule=ConstantPotential()``.
 
         Examples
         --------

@@ -43,8 +43,7 @@ class _ByChargeRatio:
         """Probability of each ion, shape (n,); 0 without a neighbour. ValueError if the emissions have no targets."""
         if emissions.charge_ratios is None:
             raise ValueError(
-                f"{type(self).__name__} needs the charges of the neighbours, which this run does not have: run with "
-                "response_settings=ResponseSettings.wide()"
+                f"{type(self).__name__} needs the `targets` and `charge_ratios` of the emissions, got none"
             )
         ratios = emissions.charge_ratios[:, 0]
         known = np.isfinite(ratios)
@@ -121,8 +120,7 @@ class Migration(_ByChargeRatio):
     >>> print(f"{nickel.threshold:.2f} {aluminium.threshold:.2f}")
     0.81 1.63
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
-    >>> wide, rule = ae.ResponseSettings.wide(), ae.ConstantPotential()
-    >>> run = ae.Simulation(tip, seed=1, response_settings=wide, rule=rule).run(60)
+    >>> run = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential()).run(60)
     >>> round(float(nickel.probabilities(run.emissions).mean()), 2)
     0.4
     """

@@ -189,10 +189,7 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     if sharpness == 0.0 or n == 0:
         return shares
     if ratios is None:
-        raise ValueError(
-            "a sharpness > 0 needs the targets of the roll-up, which this run does not have: run with "
-            "response_settings=ResponseSettings.wide()"
-        )
+        raise ValueError("a sharpness > 0 needs the `targets` and `charge_ratios` of the emissions, got none")
     known = np.isfinite(ratios[:, 1:])
     relative = np.where(known, ratios[:, 1:], 0.0) / np.where(ratios[:, :1] > 0, ratios[:, :1], 1.0)
     shares[:, 1:] = np.where(known, exponential((relative - 1.0) / sharpness), 0.0)
@@ -204,8 +201,7 @@ def _mean_targets(emissions, shares):
     targets = emissions.targets
     if targets is None:
         raise ValueError(
-            "shares of several neighbours need the targets of the roll-up, which this run does not have: run with "
-            "response_settings=ResponseSettings.wide()"
+            "shares of several neighbours need the `targets` and `charge_ratios` of the emissions, got none"
         )
     targets = np.where(np.isfinite(targets), targets, targets[:, :1])
     mean = shares[..., 0, None] * targets[:, None, 0]

@@ -291,12 +291,10 @@ class Explorer:
         return float(f"{max(self.bins_like(bins).bin_size):.2g}")
 
     def controls(self, mechanism: str) -> tuple[Control, ...]:
-        """Controls of a mechanism that this run permits: sharpness and height need wide responses."""
-        settings, controls = self.run.response_settings, controls_of(mechanism)
-        if not settings.is_wide:
-            return tuple(control for control in controls if control.name not in ("sharpness", "height"))
+        """Controls of a mechanism, with heights that this run permits."""
+        height = self.run.response_settings.height
         return tuple(
-            replace(control, high=settings.height) if control.name == "height" else control for control in controls
+            replace(control, high=height) if control.name == "height" else control for control in controls_of(mechanism)
         )
 
     @property
@@ -313,7 +311,7 @@ class Explorer:
     ) -> Registration:
         """Register the run on the measurement: the best of several emissions. Returns `registration`.
 
-        It is set at each emission that is better than those before.
+        It is set at each emission that is better than those before and not doubtful, and at the end.
 
         Parameters
         ----------
@@ -358,9 +356,11 @@ class Explorer:
             progress(done, len(perturbations))
             if registration is not None and (best is None or registration.score > best.score):
                 best = registration
-                self.set_registration(best)
+                if not best.doubtful:
+                    self.set_registration(best)
         if best is None:
             raise failed
+        self.set_registration(best)
         best.warn_if_doubtful()
         return best
 

@@ -4,8 +4,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from bokeh.models import AutocompleteInput
+from bokeh.models import AutocompleteInput, TextInput
 
+from apt_evap.explore.dropped_file import DROPPED
 from apt_evap.explore.search_process import start_thread
 from apt_evap.explore.start_page import files_to_open
 from apt_evap.explore.widgets import LEFT
@@ -48,6 +49,8 @@ class FilePanel:
             visible=read is not None,
         )
         self.field.on_change("value", lambda attr, old, new: self._named())
+        self.dropped = TextInput(visible=False, name=DROPPED)
+        self.dropped.on_change("value", lambda attr, old, new: self._open_dropped(new))
 
     def open(self, path: str) -> None:
         """Read a file in a thread, and make the page again; only what cannot be read leaves the page."""
@@ -65,6 +68,10 @@ class FilePanel:
             self._later(make_again, 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._note, sentence), 0))
+
+    def _open_dropped(self, path):
+        if path:  # "" comes before the same path again
+            self.open(path)
 
     def _named(self):
         if self._read is not None and (path := self.field.value.strip()):

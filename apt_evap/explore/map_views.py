@@ -58,7 +58,7 @@ class MapFigures:
             self._add_figure(name, source, colors)
         if both:
             self._add_comparison()
-        self.mode = RadioButtonGroup(labels=list(MODES), active=0, visible=both, width=LEFT - 10)
+        self.mode = RadioButtonGroup(labels=list(MODES), active=0, visible=both, width=LEFT - 10, name="mode")
         self.mode.on_change("active", lambda attr, old, new: self._mode_changed())
         self.same_scale = Toggle(label="same scale", visible=both, width=100)
         self.same_scale.on_change("active", lambda attr, old, new: self._put_scales())

@@ -12,6 +12,7 @@ from bokeh.models import Button, CustomJS, GlobalInlineStyleSheet, Widget
 
 from apt_evap.explore.code_panel import CodePanel
 from apt_evap.explore.display_panel import DisplayPanel
+from apt_evap.explore.dropped_file import DROP, TOLD
 from apt_evap.explore.emission_panel import EmissionPanel
 from apt_evap.explore.explorer import Explorer, ExplorerMaps, ExplorerSettings
 from apt_evap.explore.file_panel import FilePanel
@@ -25,7 +26,8 @@ from apt_evap.explore.pole_panel import PolePanel
 from apt_evap.explore.profile_panel import ProfilePanel
 from apt_evap.explore.registration_panel import RegistrationPanel
 from apt_evap.explore.rings_panel import RingsPanel
-from apt_evap.explore.run_panel import RunPanel, ServerState
+from apt_evap.explore.run_panel import RunPanel
+from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.search_process import guarded
 from apt_evap.explore.specimen_panel import SpecimenPanel
 from apt_evap.explore.spectrum_panel import SpectrumPanel
@@ -39,9 +41,12 @@ from apt_evap.specimen.materials import MATERIALS
 FIRST_MAP = 1000
 """Time that the browser has for the first maps before the registration begins [ms]: it keeps a processor busy."""
 _KEY_B = """
+if (window.apt_evap_key) return
+window.apt_evap_key = true
 document.addEventListener("keydown", event => {
   const inside = event.composedPath()[0]
-  if (event.key == "b" && !["INPUT", "TEXTAREA", "SELECT"].includes(inside.tagName))
+  const mode = [...Bokeh.documents[0].all_models].filter(model => model.name == "mode").at(-1)
+  if (mode?.visible && event.key == "b" && !["INPUT", "TEXTAREA", "SELECT"].includes(inside.tagName))
     mode.active = mode.active == 2 ? 0 : 2
 })
 """
@@ -92,12 +97,15 @@ class Page:
         self.registration: RegistrationPanel | None = None
         self.simulation: RunPanel | None = None
         self.index: IndexPanel | None = None
+        state = ServerState() if state is None else state
+        self.start: StartPage | None = None
         if explorer is None:
-            self.start = StartPage(self.files.open) if opened is not None else None
+            if opened is not None:
+                self.start = StartPage(self.files.open, state, self._later)
             body = [] if self.start is None else [self.start.column]
         else:
             self.maps = explorer.show(explorer.start if settings is None else settings)
-            self._make_panels(registration_of, ServerState() if state is None else state, read is not None)
+            self._make_panels(registration_of, state, read is not None)
             self.put(self.maps)
             body = [row(self._left(), self._right(), sizing_mode="stretch_width")]
         self.root = column(self._head(), self.summary.notes, *body, sizing_mode="stretch_width")
@@ -110,7 +118,7 @@ class Page:
     def close(self) -> None:
         """End what runs in the background."""
         self._tasks.close()
-        for panel in (self.registration, self.index, self.simulation):
+        for panel in (self.registration, self.index, self.simulation, self.start):
             if panel is not None:
                 panel.close()
 
@@ -189,7 +197,7 @@ class Page:
 
     def _head(self):
         return row(
-            self.files.field, self.summary.facts, self.style,
+            self.files.field, self.files.dropped, self.summary.facts, self.style,
             sizing_mode="stretch_width", styles={"align-items": "center", "gap": "12px"},
         )  # fmt: skip
 
@@ -240,10 +248,11 @@ class Page:
             widget.stylesheets = [*widget.stylesheets, WIDGETS]
         self.root.styles = page_styles(STYLES[0])
         self.root.stylesheets = [GlobalInlineStyleSheet(css="body { margin: 0; }")]
-        if self.registration is not None:
-            self.document.js_on_event(DocumentReady, CustomJS(args={"mode": self.figures.mode}, code=_KEY_B))
-        if self.explorer is None and self.start is not None:
-            self.document.js_on_event(DocumentReady, self.start.drop)
+        self.document.js_on_event(DocumentReady, CustomJS(code=_KEY_B))  # of the first page of a document
+        if self.files.field.visible:
+            if self.start is None:
+                self.summary.notes.name = TOLD
+            self.document.js_on_event(DocumentReady, DROP)
         self.document.add_root(self.root)
 
     def _next_style(self):

@@ -14,28 +14,12 @@ from bokeh.models import Button, Div, NumericInput, TextInput
 from apt_evap._common.files import check_path
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import short_text
-from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.explore.run_progress import RunProgress, ServerState
 from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.widgets import LEFT, group
 from apt_evap.fit.start_settings import StartSettings
 
 _SIMULATE = "simulate this specimen"
-INTERVAL = 500
-"""Time between two updates of the state of the run [ms]."""
-
-
-class ServerState:
-    """State of all pages of a server, which outlives a page that is loaded again."""
-
-    def __init__(self) -> None:
-        self.run: BackgroundRun | None = None
-        """The run in the background."""
-        self.doubt = ""
-        """What is not sure about the settings of the run, for the page."""
-        self.registration_options: dict[str, dict[str, Any]] = {}
-        """Options of `register` for the files of runs."""
-        self.indexed: dict[str, dict[str, Any]] = {}
-        """What `IndexPanel` keeps, for the files of measurements."""
 
 
 class RunPanel:
@@ -70,7 +54,7 @@ class RunPanel:
         search_before: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
         self._settings, self._state, self._later = settings, state, later
-        self._put_code, self._open_run = put_code, open_run
+        self._put_code = put_code
         self._search_before = search_before or (lambda then: then())
         self._confirmed = ""  # the file whose replacement was asked for
         half = (LEFT - 20) // 2
@@ -86,13 +70,12 @@ class RunPanel:
         self.start.on_click(self._start_or_stop)
         further = group("more", [row(self.file, self.minutes), row(self.write, self.start)], active=False)
         self.column = column(self.simulate, self.text, further)
-        self._closed = False
-        if state.run is not None:
-            self._update()
+        labels = {self.start: "start the run", self.simulate: _SIMULATE}
+        self._progress = RunProgress(state, self.text, labels, later, open_run)
 
     def close(self) -> None:
         """Show the run no longer; it goes on."""
-        self._closed = True
+        self._progress.close()
 
     @property
     def path(self) -> Path:
@@ -132,15 +115,14 @@ class RunPanel:
         def work():
             made = self._settings(minutes, thread_count())
             made.save(path)
-            self._later(partial(self._written, f"wrote {path}: {made.cost}", made, path), 0)
+            self._later(partial(self._written, f"wrote {path}: {made.cost}", made), 0)
 
         start_thread(work, lambda sentence: self._later(partial(self._written, sentence), 0))
 
-    def _written(self, text, made=None, path=None):
+    def _written(self, text, made=None):
         self.write.disabled = False
         self._show(text)
         if made is not None:
-            self._state.registration_options[str(path.with_suffix(".h5"))] = made.registration
             self._put_code(made.text)
 
     def _simulate_or_stop(self):
@@ -148,9 +130,7 @@ class RunPanel:
 
     def _simulate_specimen(self):
         """Write settings to a new file and start their run, or stop the run."""
-        run = self._state.run
-        if run is not None and run.active:
-            run.stop()
+        if self._progress.stop():
             return
         path = self.path.with_suffix(".toml")
         self.simulate.disabled = True
@@ -176,7 +156,7 @@ class RunPanel:
     def _made(self, made, path):
         self.simulate.disabled = False
         self.file.value = str(path)
-        self._written(f"wrote {path}: {made.cost}", made, path)
+        self._written(f"wrote {path}: {made.cost}", made)
         self._state.doubt = "" if made.indexing.decided else "not decided: this is the first candidate; "
         self._start_or_stop()
 
@@ -184,40 +164,13 @@ class RunPanel:
         guarded(self._start_or_stop_run, self._show)()
 
     def _start_or_stop_run(self):
-        run = self._state.run
-        if run is not None and run.active:
-            run.stop()
+        if self._progress.stop():
             return
         path = self.path
         if not path.is_file():
             self._show(f"{path} does not exist yet: write the settings first")
             return
-        self._state.run = BackgroundRun(path, path.with_suffix(".h5"))
-        self._update()
-
-    def _update(self):
-        """Show the state of the run, again and again until it ends."""
-        run = self._state.run
-        if self._closed or run is None:
-            return
-        active = run.active  # set by another thread
-        self.start.label = "stop the run" if active else "start the run"
-        self.simulate.label = "stop the run" if active else _SIMULATE
-        if active:
-            left = "" if run.seconds_left is None else f", {_duration(run.seconds_left)} left"
-            state = run.message or f"{run.ions:,} of {run.n_ions:,} ions{left}"
-            self.text.text = (
-                f'<progress value="{run.ions}" max="{run.n_ions or 1}" style="width: 100%"></progress><br>'
-                f"{self._state.doubt}{escape(state)}; {escape(str(run.output))}, opened here at its end"
-            )
-            self._later(self._update, INTERVAL)
-        elif not run.finished:
-            self._show(run.message)
-        else:
-            self._state.run = None
-            self._show(f"{run.output} has all ions: apt-evap explore {run.output}")
-            if self._open_run is not None:
-                self._open_run(str(run.output))
+        self._progress.start(path)
 
 
 def _free_path(path: Path, text: str) -> Path:
@@ -229,7 +182,3 @@ def _free_path(path: Path, text: str) -> Path:
             return path
         path = path.with_stem(f"{path.stem.removesuffix(f'_{number - 1}')}_{number}")
     raise AssertionError("unreachable")
-
-
-def _duration(seconds):
-    return f"{seconds / 60:.0f} min" if seconds > 100 else f"{seconds:.0f} s"

@@ -14,7 +14,7 @@ from bokeh.util.token import generate_session_id
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import remember_file
-from apt_evap.explore.run_panel import ServerState
+from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.start_page import EXAMPLE, write_example
 from apt_evap.explore.upload import UploadHandler
 from apt_evap.maps.registration.register import Registration
@@ -108,8 +108,6 @@ def serve(
         remember_file(path)
         if before is not None and shown[0] is not None and shown[0].names[1] != path:
             shown[0].keep_ions(before)
-        if shown[0] is not None:
-            shown[0].registration_options = state.registration_options.get(path, {})
 
         def make_again():
             document.clear()

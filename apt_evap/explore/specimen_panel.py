@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from bokeh.layouts import row
+from bokeh.layouts import column, row
 from bokeh.models import ColumnDataSource, RadioButtonGroup, Select, Slider
 
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
@@ -46,8 +46,10 @@ class SpecimenPanel:
         self.color.on_change("value", lambda attr, old, new: self._put_surface())
         self.side = RadioButtonGroup(labels=[*SIDES], active=None)
         self.side.on_change("active", lambda attr, old, new: self._side_changed())
-        choices = row(self.color, self.side, styles={"flex-wrap": "wrap", "align-items": "end"})
-        self.widgets: list[Any] = [self.view.figure, choices, slider_with_number(self.radius)]
+        choices = column(self.color, self.side, slider_with_number(self.radius))
+        self.widgets: list[Any] = [
+            row(self.view.figure, choices, sizing_mode="stretch_width", styles={"flex-wrap": "wrap", "gap": "12px"})
+        ]
         self._put_surface()
 
     def put(self, maps: ExplorerMaps) -> None:

@@ -53,6 +53,7 @@ marked.data.y = places.map(place => place[1])
 marked.change.emit()
 """
 _RADIUS = 0.6  # of a sphere, in nearest neighbour distances: few atoms behind are seen through the gaps
+_WIDEST = 480  # px, of the figure: its controls are beside it where there is place
 _GRASP = "points.grasped = [cb_obj.sx, cb_obj.sy, ...points.tags]"
 _TURN = """
 const [x, y, azimuth, elevation] = points.grasped
@@ -68,6 +69,7 @@ class SpecimenView:
         self.figure: Any = square("specimen: drag to turn it", (-1, 1, -1, 1), [wheel])
         self.figure.toolbar.active_scroll = wheel
         self.figure.axis.visible = False
+        self.figure.update(styles=self.figure.styles | {"max-width": f"{_WIDEST}px"})
         self.points = ColumnDataSource({name: [] for name in ("x", "y", "z", "color", "radius")})
         self.points.tags = list(SIDES["oblique"])
         self.marked = ColumnDataSource({name: [] for name in ("x", "y", "px", "py", "pz")})

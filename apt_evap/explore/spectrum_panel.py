@@ -32,6 +32,7 @@ from apt_evap.io.rrng import write_rrng
 
 _BINS = 2000
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
+_CURVE = "#8298b0"  # seen in both styles
 _ALL = "all ions"
 _OF_MASS = "ions of a range"
 
@@ -97,8 +98,8 @@ class SpectrumPanel:
         self.labels = ColumnDataSource({"x": [], "y": [], "label": [], "color": []})
         self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.35,
                          line_color="color")  # fmt: skip
-        self.figure.step("x", "y", source=self.counts, mode="after", line_color="#e3e6ea")
-        self.figure.line("x", "y", source=self.background, line_color="#98a2ad", line_dash="dashed")
+        self.figure.step("x", "y", source=self.counts, mode="after", line_color=_CURVE)
+        self.figure.line("x", "y", source=self.background, line_color=_CURVE, line_dash="dashed")
         self.figure.add_layout(
             LabelSet(x="x", y="y", text="label", text_color="color", source=self.labels, text_font_size="13px",
                      y_offset=2, text_align="center")

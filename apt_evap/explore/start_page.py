@@ -1,5 +1,6 @@
 """The page without a file: files of the folder, those that were opened last, an example, a place to drop one."""
 
+import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
 from html import escape
@@ -7,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.layouts import column
-from bokeh.models import Button, CustomJS, Div, InlineStyleSheet, TextInput
+from bokeh.layouts import column, row
+from bokeh.models import Button, Div, InlineStyleSheet
 
 from apt_evap._common.files import replace_file
 from apt_evap.detection.projection import Projection
+from apt_evap.explore.dropped_file import TOLD
 from apt_evap.explore.recent_files import recent_files
+from apt_evap.explore.run_progress import RunProgress, ServerState
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.master_pattern import master_patterns
 
@@ -21,6 +24,7 @@ RUNS, MEASUREMENTS = (".h5",), (".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
 EXAMPLE = "example_ni111.npz"
 """File of the example, a map as nickel gives it; it is written when it is opened."""
 _MOST = 40  # files of a kind
+_LARGEST_SETTINGS = 1 << 20  # bytes
 _UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 _CARDS = ":host { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 24px; }"
 _CARD = """
@@ -32,27 +36,6 @@ _DROP_STYLE = """
 :host { border: 2px dashed var(--edge); border-radius: 12px; padding: 28px; text-align: center; font-size: 16px; }
 :host(.over) { border-color: #2f6fb3; background: var(--panel); }
 """
-# the browser sends a dropped file to the server, which puts it into its folder
-_DROP = """
-const told = text => { zone.text = text }
-const send = file => {
-  const query = new URLSearchParams(location.search)
-  query.set("name", file.name)
-  const request = new XMLHttpRequest()
-  request.open("POST", "upload?" + query)
-  request.upload.onprogress = event => told(`copying ${file.name}: ${Math.round(100 * event.loaded / event.total)} %`)
-  request.onload = () => {
-    if (request.status == 200) { path.value = request.responseText } else { told(request.responseText) }
-  }
-  request.onerror = () => told("the explorer cannot be reached")
-  request.send(file)
-}
-document.addEventListener("dragover", event => event.preventDefault())
-document.addEventListener("drop", event => {
-  event.preventDefault()
-  if (event.dataTransfer.files.length) send(event.dataTransfer.files[0])
-})
-"""
 
 
 class StartPage:
@@ -62,23 +45,33 @@ class StartPage:
     ----------
     open_file : callable
         Opens a file.
+    state : ServerState
+        Has the run of all pages.
+    later : callable
+        As for `Page`.
     """
 
-    def __init__(self, open_file: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        open_file: Callable[[str], None],
+        state: ServerState,
+        later: Callable[[Callable[[], None], int], Any],
+    ) -> None:
         self._open = open_file
-        self.dropped = TextInput(visible=False)
-        self.dropped.on_change("value", lambda attr, old, new: open_file(new))
+        self.stop = Button(width=120, visible=False)
+        self.text = Div(sizing_mode="stretch_width", margin=0)
+        self.progress = RunProgress(state, self.text, {self.stop: ""}, later, open_file)
+        self.stop.on_click(self.progress.stop)
         self.zone = Div(
-            text="Drop a measured file or a run here", sizing_mode="stretch_width",
+            text="Drop a measured file or a run here", sizing_mode="stretch_width", name=TOLD,
             stylesheets=[InlineStyleSheet(css=_DROP_STYLE)],
         )  # fmt: skip
-        self.drop = CustomJS(args={"zone": self.zone, "path": self.dropped}, code=_DROP)
-        """What the browser does when the page is there."""
         self.buttons: dict[str, Button] = {}
         folder = _files()
         cards = [
             self._card("Measurements in this folder", folder[0], "no .epos, .pos, .apt, .raw, .nxs or .npz"),
             self._card("Runs in this folder", folder[1], "no .h5"),
+            self._card("Settings: a click simulates", _settings(), "no .toml of a simulation"),
             self._card("Opened last", [path for path in recent_files() if Path(path).is_file()], "nothing yet"),
             self._card("Example", [EXAMPLE], ""),
         ]
@@ -90,7 +83,7 @@ class StartPage:
         self.column = column(
             Div(text=hint, sizing_mode="stretch_width", styles={"font-size": "15px", "line-height": "1.7"}),
             self.zone,
-            self.dropped,
+            row(self.text, self.stop, sizing_mode="stretch_width"),
             column(*cards, sizing_mode="stretch_width", stylesheets=[InlineStyleSheet(css=_CARDS)]),
             sizing_mode="stretch_width",
             styles={"max-width": "1200px", "margin": "24px auto", "gap": "20px", "padding": "0 24px"},
@@ -102,13 +95,24 @@ class StartPage:
         for path in paths[:_MOST]:
             label = "nickel [111], as an instrument would see it" if path == EXAMPLE else _label(path)
             button = Button(label=label, sizing_mode="stretch_width", stylesheets=[InlineStyleSheet(css=_CARD)])
-            button.on_click(partial(self._open, path))
+            button.on_click(partial(self._run if path.endswith(".toml") else self._open, path))
             self.buttons[path] = button
             rows.append(button)
         more = len(paths) - _MOST
         text = f"{more} more: type their names above" if more > 0 else "" if rows else empty
         head = Div(text=f"<b>{title}</b>", styles={"font-size": "15px"})
         return column(head, *rows, *([Div(text=f"<small>{text}</small>")] if text else []))
+
+    def close(self) -> None:
+        """Show the run no longer; it goes on."""
+        self.progress.close()
+
+    def _run(self, path):
+        """Run a settings file; its run is opened at its end."""
+        if self.progress.active:
+            self.text.text = "a run is active: stop it first"
+            return
+        self.progress.start(Path(path).absolute())
 
 
 def write_example() -> None:
@@ -134,6 +138,21 @@ def _files():
     """Measurements and runs in the current folder and the folders in it."""
     paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern)) if path.is_file()]
     return tuple([str(path) for path in paths if path.suffix.lower() in kind] for kind in (MEASUREMENTS, RUNS))
+
+
+def _settings():
+    """Settings files of simulations in the current folder and the folders in it."""
+    paths = [path for pattern in ("*.toml", "*/*.toml") for path in sorted(Path().glob(pattern)) if path.is_file()]
+    return [str(path) for path in paths if _is_simulation(path)]
+
+
+def _is_simulation(path):
+    if path.stat().st_size > _LARGEST_SETTINGS:
+        return False
+    try:
+        return {"tip", "simulation"} <= tomllib.loads(path.read_text(encoding="utf-8")).keys()
+    except (OSError, ValueError, RecursionError):
+        return False
 
 
 def _label(path):

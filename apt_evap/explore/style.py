@@ -25,11 +25,12 @@ small { font-size: 12px; color: var(--faint); }
 .noUi-connect { background-color: #2f6fb3; }
 :host(.number) .bk-input { height: 26px; padding: 2px 6px; }
 :host(.group) .bk-btn { background: transparent; color: var(--ink); border-width: 0 0 1px 0; border-radius: 0;
-  text-align: left; font-weight: 600; }
+  text-align: left; font-weight: 600; box-shadow: none; }
 :host(.group) .bk-btn::before { content: "\\25b8  "; }
+:host(.group) .bk-btn.bk-active { box-shadow: none; }
 :host(.group) .bk-btn.bk-active::before { content: "\\25be  "; }
 :host(.tabs) .bk-btn { background: transparent; color: var(--ink); border-width: 0 0 3px 0; border-radius: 0;
-  border-color: var(--edge); padding: 6px 14px; }
+  border-color: var(--edge); padding: 6px 14px; box-shadow: none; }
 :host(.tabs) .bk-btn.bk-active { background: transparent; color: var(--ink); border-color: #2f6fb3; font-weight: 600; }
 pre { white-space: pre-wrap; color: var(--ink); }
 table { border-spacing: 8px 0; }
@@ -41,7 +42,7 @@ def page_styles(style: str) -> dict[str, str]:
     """CSS of the outermost widget; the colours are variables for those inside (dict)."""
     colors = {f"--{name}": color for name, color in _COLORS[style].items()}
     text = {"background-color": "var(--paper)", "color": "var(--ink)", "font-family": "system-ui, sans-serif"}
-    return colors | text | {"min-height": "100vh"}
+    return colors | text | {"min-height": "100vh", "padding": "0 8px", "box-sizing": "border-box"}
 
 
 def theme(style: str) -> Theme:

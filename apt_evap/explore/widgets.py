@@ -22,11 +22,14 @@ LEFT = 300
 _NARROWEST = 290  # px, of a map: two of them stand side by side in a window of 1000 px
 _ABOVE = 120  # px of the window above and below a map
 _RATIO = 0.9  # width over height of a map, with its axes and colour bar
+_WIDEST = f"{_RATIO} * max(300px, 100vh - {_ABOVE}px)"
 # one map has the tabs beside it, two maps only in a wide window
-_WORK = """
-:host { display: grid; grid-template-columns: minmax(0, 1fr); gap: 12px; align-items: start; }
-@media (min-width: 1150px) { :host(.one) { grid-template-columns: minmax(0, 1.4fr) minmax(360px, 1fr); } }
-@media (min-width: 1600px) { :host(.two) { grid-template-columns: minmax(0, 1fr) 420px; } }
+_WORK = f"""
+:host {{ display: grid; grid-template-columns: minmax(0, 1fr); gap: 12px; align-items: start; }}
+@media (min-width: 1150px) {{ :host(.one) {{ grid-template-columns: minmax(0, calc({_WIDEST})) minmax(360px, 1fr); }} }}
+@media (min-width: 1600px) {{
+  :host(.two) {{ grid-template-columns: minmax(0, calc(2 * {_WIDEST})) minmax(360px, 1fr); }}
+}}
 """
 
 # the frame of a figure is seldom square: the longer direction shows more, so that both have the same scale
@@ -38,6 +41,11 @@ for (const [range, stretch] of [[fig.x_range, Math.max(1, 1 / ratio)], [fig.y_ra
   const middle = (low + high) / 2, half = (high - low) / 2 * stretch
   range.setv({start: middle - half, end: middle + half, reset_start: middle - half, reset_end: middle + half})
 }
+"""
+# tabs below the maps may begin near the end of the window
+_TAB = """
+places.forEach((place, k) => { place.visible = k == choice.active })
+setTimeout(() => Bokeh.index.find_one(places[choice.active])?.el.scrollIntoView({block: "nearest"}), 200)
 """
 _COPY = """
 navigator.clipboard.writeText(text.text)
@@ -61,7 +69,7 @@ def square(title: str, extent: Sequence[float], tools: Sequence[Any], **options:
         sizing_mode="scale_width",
         aspect_ratio=_RATIO,
         min_width=_NARROWEST,
-        styles={"max-width": f"calc({_RATIO} * max(300px, 100vh - {_ABOVE}px))"},
+        styles={"max-width": f"calc({_WIDEST})"},
         tools=list(tools),
         toolbar_location=None,
         **({"x_range": Range1d(), "y_range": Range1d()} | options),
@@ -169,8 +177,7 @@ class Tabs:
             column(*parts, sizing_mode="stretch_width", visible=number == 0)
             for number, parts in enumerate(contents.values())
         ]
-        show = "places.forEach((place, k) => { place.visible = k == choice.active })"
-        self.choice.js_on_change("active", CustomJS(args={"places": self._places, "choice": self.choice}, code=show))
+        self.choice.js_on_change("active", CustomJS(args={"places": self._places, "choice": self.choice}, code=_TAB))
         self.column = column(self.choice, *self._places, sizing_mode="stretch_width")
 
     def show(self, title: str) -> None:

@@ -23,6 +23,7 @@ from apt_evap.config.material_text import material_value
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.config.simulation_file import config_of
 from apt_evap.config.toml_text import comment
+from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import RollUp
@@ -43,6 +44,7 @@ RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
 """Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
 """Energy [eV], height of the start [nm] and sharpness of the emission, those of the master patterns."""
+_MEASURED = "# Measured: "  # before the name of the measured file
 ROLLS = 0.1
 """Fraction of the roll-up pattern below which no ion rolls up."""
 _SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
@@ -124,6 +126,35 @@ def is_start(path: AnyPath) -> bool:
     """Whether a file is a settings file made from a measured map."""
     with open_for_reading(path) as file:
         return file.read(len(MARK)) == MARK.encode()
+
+
+def registration_start_of(path: AnyPath, measured: DetectorMap) -> dict[str, Any]:
+    """Return `registration_start` of a run, read from its settings file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Settings file that `is_start`.
+    measured : DetectorMap
+        The measured map.
+
+    Returns
+    -------
+    dict
+        Empty if the settings were made from a file of another name.
+
+    Raises
+    ------
+    ValueError
+        If the file contains no such settings, or the map no field of view.
+    """
+    with open_for_reading(path) as file:
+        text = file.read().decode()
+    name = text.splitlines()[1].removeprefix(_MEASURED)
+    if Path(name).name != Path(measured.source).name:
+        return {}
+    distance = check_number(tomllib.loads(text).get("detector", {}).get("distance"), "detector.distance", above=0)
+    return registration_start(disc_of(measured).centre, distance / _SIMULATED_COMPRESSION)
 
 
 def settings_of(
@@ -252,7 +283,7 @@ def _text(indexing, radii, size, lens, factors):
     limit = float(np.clip(_MOST_ENERGY * _VOLTAGE / (material.charge_state * volts), *_LIMITS))
     lines = [
         f"{MARK} {__version__}.",
-        comment(f"Measured: {indexing.map.source or 'a map'}"),
+        comment(f"{_MEASURED.removeprefix('# ')}{indexing.map.source or 'a map'}"),
         *(() if indexing.decided else ("# NOT DECIDED: axis and rotation are those of the first candidate.",)),
         "",
         *_tip_lines(indexing, radii, size, lens, factors),
@@ -264,7 +295,6 @@ def _text(indexing, radii, size, lens, factors):
         'name = "ConstantPotential"',
         "",
         "[responses]",
-        "wide = true    # for ions that roll onto a mean of their neighbours",
         f"energy_limit = {limit:.2f}    # eV at the simulated voltage, {_VOLTAGE:g} V",
         "",
         "[flights]",

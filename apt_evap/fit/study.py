@@ -128,8 +128,8 @@ class Study:
     optimum, refined : Optimum
         The best point of the grid, and the maximum of a spline around it.
     baselines : dict of Score
-        Scores of the "unperturbed" and "thermal" maps. For a pure metal at a constant potential with wide responses
-        also of the "rule of the metal", `RollUp.of_metal`: nothing in it is fitted to the map.
+        Scores of the "unperturbed" and "thermal" maps. For a pure metal at a constant potential also of the "rule of
+        the metal", `RollUp.of_metal`: nothing in it is fitted to the map.
     plain : dict of Score
         Uncorrected scores of the baselines and of the "optimum", for comparison with the ceiling.
     gain : Score

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.mass_spectrum import Spectrum
 from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge
 from apt_evap.simulation.run import Run
@@ -32,6 +33,7 @@ def spectrum(
     bin_width: float = 0.02,
     limits: tuple[float, float] | None = None,
     elements: Sequence[str] | None = None,
+    ranges: Ranges | None = None,
 ) -> DrawnAxes:
     """Draw one or more mass spectra with a logarithmic scale, and label the isotopes.
 
@@ -52,6 +54,8 @@ def spectrum(
     elements : sequence of str, optional
         Elements of `ISOTOPES` to label: peaks of their isotopes with a charge for which the most abundant isotope has a
         peak. By default those of the runs; () for none.
+    ranges : Ranges, optional
+        Drawn with their names in place of the peaks of a Spectrum.
 
     Returns
     -------
@@ -65,7 +69,7 @@ def spectrum(
         bins, or the number of labels differs.
     """
     if isinstance(ions, Spectrum):
-        return _draw_named(ions, labels, ax, bin_width, limits)
+        return _draw_named(ions, labels, ax, bin_width, limits, ranges)
     spectra = [ions] if isinstance(ions, Run | Hits) else list(check_sequence(ions, "ions", "runs or hits"))
     labels = [None] * len(spectra) if labels is None else list(labels)
     if not spectra or len(labels) != len(spectra):
@@ -110,9 +114,17 @@ def spectrum(
     return ax
 
 
-def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits):
-    """Draw a spectrum with its background, its ranges, and the names of its peaks."""
-    intervals = [interval for peak in spectrum_of_ions.peaks for interval in peak.intervals]
+def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
+    """Draw a spectrum with its background, its ranges, and the names of its peaks, or of other ranges."""
+    if ranges is None:
+        named = [
+            (peak.formula, _subscripts(peak.formula) + raised_charge(peak.charge), peak.intervals)
+            for peak in spectrum_of_ions.peaks
+        ]
+    else:
+        rows = zip(ranges.names, ranges.low.tolist(), ranges.high.tolist(), strict=True)
+        named = [(name, name.replace("$", r"\$"), [(low, high)]) for name, low, high in rows]
+    intervals = [interval for _, _, parts in named for interval in parts]
     if limits is None:
         low, high = _default_limits([_masses(spectrum_of_ions.hits)])
         ends = np.array(intervals or [(low, high)])
@@ -131,17 +143,15 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits):
     )
     mass = _masses(spectrum_of_ions.hits)
     count = np.histogram(mass, edges)[0]
-    formulas = list(dict.fromkeys(peak.formula for peak in spectrum_of_ions.peaks))
+    formulas = list(dict.fromkeys(formula for formula, _, _ in named))
     places: list[float] = []
-    for peak in spectrum_of_ions.peaks:
-        color = f"C{1 + formulas.index(peak.formula) % 9}"
-        for low, high in peak.intervals:
+    for formula, text, parts in named:
+        color = f"C{1 + formulas.index(formula) % 9}"
+        for low, high in parts:
             ax.axvspan(low, high, color=color, alpha=0.2, linewidth=0)
         tops = [
             (int(inside.max()), float(edges[first + int(np.argmax(inside))]))
-            for first, inside in (
-                (bins.start, count[bins]) for bins in (_bins_between(edges, *i) for i in peak.intervals)
-            )
+            for first, inside in ((bins.start, count[bins]) for bins in (_bins_between(edges, *i) for i in parts))
             if inside.size
         ]
         if not tops or any(abs(max(tops)[1] - place) < _WIDTH_OF_LABEL * (limits[1] - limits[0]) for place in places):
@@ -149,7 +159,7 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits):
         top, place = max(tops)
         places.append(place)
         ax.annotate(
-            _subscripts(peak.formula) + raised_charge(peak.charge), (place, max(top, 1)), xytext=(0, 4),
+            text, (place, max(top, 1)), xytext=(0, 4),
             textcoords="offset points", ha="center", va="bottom", color=color, annotation_clip=True,
         )  # fmt: skip
     bottom, top = ax.get_ylim()

@@ -2,7 +2,6 @@
 from .checkpoint import Checkpoint as Checkpoint
 from .flight.flight_pool import FlightSettings as FlightSettings
 from .flight.launch_designs import Design as Design
-from .flight.launch_designs import WideDesign as WideDesign
 from .monitor import Monitor as Monitor
 from .real_units import OperatingPoint as OperatingPoint
 from .recorder import RunInterrupted as RunInterrupted

@@ -72,6 +72,8 @@ ALWAYS = (
     Column("emissions/positions", np.float64, (3,), "nm"),
     _of_events("emissions/normals"),
     Column("emissions/neighbours", np.float64, (3,), "nm"),
+    Column("emissions/targets", np.float64, (3, 3), "nm"),
+    Column("emissions/charge_ratios", np.float64, (3,)),
     Column("emissions/charge_states", np.int32, (), "e"),
     Column("emissions/masses", np.float64, (), "Da"),
     _of_events("site"),
@@ -92,16 +94,6 @@ OPTIONAL = (
     Column("real/masses", np.float64, (), "Da", hashed=False),
     Column("real/pulse_ids", np.int64, hashed=False),
 )
-
-
-def target_columns(settings: ResponseSettings) -> list[Column]:
-    """Columns of the targets of the roll-ups; without wide responses, the only target is in `neighbours`."""
-    if not settings.is_wide:
-        return []
-    return [
-        Column("emissions/targets", np.float64, (3, 3), "nm"),
-        Column("emissions/charge_ratios", np.float64, (3,)),
-    ]
 
 
 def flown_columns(number: int) -> tuple[Column, ...]:
@@ -156,7 +148,7 @@ def events_of(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 def every_column_of(run: Any) -> list[Column]:
     """The columns that a run has."""
-    columns = [*ALWAYS, *OPTIONAL, *target_columns(run.response_settings)]
+    columns = [*ALWAYS, *OPTIONAL]
     columns += [column for number in range(len(run.flown)) for column in flown_columns(number)]
     columns += response_columns(run.response_settings)
     arrays = columns_of(run, columns)

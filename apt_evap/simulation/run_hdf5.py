@@ -26,7 +26,6 @@ from apt_evap.simulation.columns import (
     flown_columns,
     parts_of,
     response_columns,
-    target_columns,
 )
 from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.history import CapHistory, History
@@ -124,18 +123,22 @@ def _put_state(group, state, first_event):
 def read_run(path: AnyPath) -> dict[str, Any]:
     """Read the arguments of a Run from a file; FileError if it is missing, damaged or not a run."""
     with open_hdf5(path, "a run") as file:
-        label = file.label
-        if label is None or label.kind != _RUN:
-            raise FileError(f"{file.name!r} is not a run{f', but {label.kind!r}' if label else ''}")
+        label = _check_label(file.label, file.name)
         return _read(file, label.rows)
+
+
+def _check_label(label, name):
+    """The label of a run; FileError if it is another one."""
+    if label is not None and label.kind.startswith(f"{_RUN} of format"):
+        raise FileError(f"{name!r} is a {label.kind}, which this version cannot read: repeat the run")
+    if label is None or label.kind != _RUN:
+        raise FileError(f"{name!r} is not a run{f', but {label.kind!r}' if label else ''}")
+    return label
 
 
 def count_ions(path: AnyPath) -> int:
     """Number of ions of the run in a file, without reading them; FileError if it is not a run."""
-    label = label_of(path)
-    if label is None or label.kind != _RUN:
-        raise FileError(f"{str(path)!r} is not a run")
-    return label.rows
+    return _check_label(label_of(path), str(path)).rows
 
 
 def is_run(path: AnyPath) -> bool:
@@ -144,15 +147,14 @@ def is_run(path: AnyPath) -> bool:
         label = label_of(path)
     except FileError:
         return False
-    return label is not None and label.kind == _RUN
+    return label is not None and label.kind.split(" of ")[0] == _RUN
 
 
 def _read(file, n):
     settings = file.json(f"{_SIMULATION}/settings")
     elements = tuple(file.json(f"{_SIMULATION}/elements"))
     response_settings = from_plain(settings["responses"], ResponseSettings, what="responses")
-    optional = (*OPTIONAL, *target_columns(response_settings))
-    perturbations, columns = [], [*ALWAYS, *(column for column in optional if _place(column) in file)]
+    perturbations, columns = [], [*ALWAYS, *(column for column in OPTIONAL if _place(column) in file)]
     while (group := f"{_SIMULATION}/flown/{len(perturbations)}") in file:
         columns += flown_columns(len(perturbations))
         perturbations.append(_known(file.json(f"{group}/perturbation")))

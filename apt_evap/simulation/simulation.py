@@ -343,11 +343,8 @@ class Simulation:
         positions = self.tip.positions
         known = batch.targets >= 0
         targets = np.where(known[..., None], positions[batch.targets], np.nan)
-        columns = {}
-        if self.response_settings.is_wide:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ratios = batch.target_charges / batch.charges[:, None]
-            columns = {"targets": targets, "charge_ratios": np.where(known, ratios, np.nan)}
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = batch.target_charges / batch.charges[:, None]
         return Emissions(
             positions=positions[batch.site],
             normals=batch.normals,
@@ -356,7 +353,8 @@ class Simulation:
             masses=self.tip.masses[species],
             ions=ions,
             nearest_neighbour_distance=self.tip.nearest_neighbour_distance,
-            **columns,
+            targets=targets,
+            charge_ratios=np.where(known, ratios, np.nan),
             rollup_distances=self._rollup_distances(batch),
         )
 

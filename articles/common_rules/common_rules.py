@@ -84,7 +84,7 @@ def main():
     axis = tuple(float(index) for index in options.axis.split())
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=8 * material.a)
     rule = ae.ConstantPotential(law_field="charge") if options.constant_potential else ae.Robin()
-    simulation = ae.Simulation(tip, seed=1, rule=rule, response_settings=ae.ResponseSettings.wide())
+    simulation = ae.Simulation(tip, seed=1, rule=rule)
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
     emissions = launches(float(np.median(pilot.energy_scales)), options.sharpness)
     for _ in simulation.emitter.advance(options.skip):

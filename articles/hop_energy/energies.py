@@ -1,4 +1,4 @@
-"""Energy along the surface from the gain of the hop, beside other rules, on runs with wide responses.
+"""Energy along the surface from the gain of the hop, beside other rules, on runs with responses.
 
     python energies.py RUNS simulate Ni 80 --skip 30000 --ions 90000
     python energies.py RUNS judge Ni 80
@@ -187,7 +187,7 @@ def main():
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
     metal, radius = options.metal, options.radius
-    path = options.runs / f"{metal}_{radius}_wide.h5"
+    path = options.runs / f"{metal}_{radius}.h5"
     if options.what == "simulate":
         simulated(metal, radius, options.skip, options.ions, options.threads).save(path)
         return

@@ -1,6 +1,6 @@
-"""What in the rule of a metal fills its poles: one number of it changed at a time, on a run with wide responses.
+"""What in the rule of a metal fills its poles: one number of it changed at a time, on a run with responses.
 
-    python fills.py RUNS/Ni_80_wide.h5 --pole 1 1 1
+    python fills.py RUNS/Ni_80.h5 --pole 1 1 1
 
 The density about a pole by degree, in units of the mean of the map, and on the lines towards one family
 and beside them, as in `../three_metals/predictions.py`.

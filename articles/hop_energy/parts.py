@@ -1,6 +1,6 @@
 """Part of the atoms in the field of view that roll by the rule of the metal, with one number changed at once.
 
-python parts.py RUNS/W_160_wide.h5 RUNS/W_80_wide.h5 RUNS/Ni_160_wide.h5 ...
+python parts.py RUNS/W_160.h5 RUNS/W_80.h5 RUNS/Ni_160.h5 ...
 """
 
 import sys

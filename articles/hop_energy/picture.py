@@ -1,7 +1,7 @@
 """Measured maps of tungsten and nickel beside those of four rules, folded about their poles.
 
-    python picture.py hop_energy.png --W RUNS/W_160_wide.h5 RUNS/W_80_hops.npz
-        --Ni RUNS/Ni_160_wide.h5 RUNS/Ni_80_hops.npz
+    python picture.py hop_energy.png --W RUNS/W_160.h5 RUNS/W_80_hops.npz
+        --Ni RUNS/Ni_160.h5 RUNS/Ni_80_hops.npz
 
 The measured maps are the folded densities in `../three_metals/measured.npz`, made by `measured_numbers.py` there.
 """

@@ -1,6 +1,6 @@
 """Lines and poles of a run with responses for every emission, with the intervals that its uncertain numbers allow.
 
-    python predicted.py RUNS/Mg_160_wide.h5 --pole 0 0 0 1 --temperature 40 --other RUNS/Mg_80_wide.h5
+    python predicted.py RUNS/Mg_160.h5 --pole 0 0 0 1 --temperature 40 --other RUNS/Mg_80.h5
 
 For each family of lines about a pole: the density on the line, and 1 to 2 degrees beside it, over that 3
 to 6 degrees beside it, as in `../three_metals/predictions.py`; and the density about the pole by degree. Columns: the

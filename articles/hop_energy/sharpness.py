@@ -1,7 +1,7 @@
 """Sharpness of the mean of three neighbours against the energy along the surface, on runs of several metals.
 
-    python sharpness.py W RUNS/W_160_wide.h5 --temperature 80
-    python sharpness.py Mg RUNS/Mg_160_wide.h5
+    python sharpness.py W RUNS/W_160.h5 --temperature 80
+    python sharpness.py Mg RUNS/Mg_160.h5
 
 A row for each sharpness and part of the polarisation energy alpha F^2/2. For tungsten and nickel it has the
 amplitudes of the rings and the correlation, as in `../three_metals/judge.py`; for magnesium the density on the line

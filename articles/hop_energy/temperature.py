@@ -1,6 +1,6 @@
 """Part of the atoms that roll against the temperature, for the field of the table and for that at which atoms leave.
 
-python temperature.py RUNS/W_160_wide.h5 RUNS/Ni_160_wide.h5
+python temperature.py RUNS/W_160.h5 RUNS/Ni_160.h5
 
 "Fixed": the rule of the metal, at F_evap at every temperature. "F(T)": the same barrier of 28 kT in both, so that atoms
 leave at F_evap (1 - 28 kT/C), C = 1 eV; alpha as selected, and selected again so that the part at 80 K stays the same.

@@ -56,8 +56,8 @@ def run_of(number, radius, ions, folder=None, within=VARIATION):
         # to a tenth of a bin
         flight_settings=ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2),
         response_settings=ae.ResponseSettings(
-            site=ae.simulation.Design(1, ((0.0, 1), (1.0, 4))),
-            rolled=ae.simulation.Design(2, ((0.0, 1), (1.0, 6))),
+            site=ae.simulation.Design((1, 0), ((0.0, 1), (1.0, 4)), 6),
+            rolled=ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 6)), 18, place=True),
             bound=1.0,
         ),
     )

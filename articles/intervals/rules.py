@@ -2,7 +2,7 @@
 
     python articles/intervals/rules.py FOLDER --twins 4
 
-Tips of Ni[111], R = 20 a, with wide responses. The twins have other lattice origins, and radii, shank angles and
+Tips of Ni[111], R = 20 a. The twins have other lattice origins, and radii, shank angles and
 surface thresholds that differ by up to 10 %. Their maps have a hidden probability, sharpness and energy;
 `fit_energies` searches all three in the frame of the instrument. Runs are stored in FOLDER, so that the script can be
 stopped and continued.
@@ -38,7 +38,7 @@ def rule(energy, probability, sharpness):
 
 def run_of(number, ions, folder):
     """Run of a specimen, stored in the folder; number 0 is the one that is fitted."""
-    path = folder / f"wide{number}.h5"
+    path = folder / f"rules{number}.h5"
     if path.exists():
         return ae.load(path)
     random = np.random.default_rng((2026, number))
@@ -53,7 +53,7 @@ def run_of(number, ions, folder):
         offset_seed=number,
     )
     tip.criteria = (replace(tip.criterion, surface_threshold=sizes[2] * tip.surface_threshold),)
-    simulation = ae.Simulation(tip, seed=number, n_threads=1, response_settings=ae.ResponseSettings.wide())
+    simulation = ae.Simulation(tip, seed=number, n_threads=1)
     run = simulation.run(ions, progress=False)
     run.save(path)
     return run

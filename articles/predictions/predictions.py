@@ -57,9 +57,7 @@ def evaporate(element, axis, rules, radius, ions, path):
     material = ae.material(element)
     size = radius * material.a
     tip = ae.Tip(material, size, axis=axis, shank_length=2 * size, depth=6 * material.a)
-    # wide responses are not computed, but their settings record the neighbours for the sharpness
-    settings = ae.ResponseSettings.wide()
-    simulation = ae.Simulation(tip, seed=1, rule=RULES[rules][0], response_settings=settings)
+    simulation = ae.Simulation(tip, seed=1, rule=RULES[rules][0])
     # the first ions give the voltage at which the cap has the evaporation field
     pilot = simulation.run(256, responses=False, progress=False).at_evaporation_field()
     emission = emission_of(material, rules, float(np.median(pilot.energy_scales)))

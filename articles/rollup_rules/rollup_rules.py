@@ -5,7 +5,7 @@ Rules of the roll-up
 Contrast of the zone lines about a (111) pole of nickel for several rules of the roll-up, all from one run.
 
 In the model of Shaikh et al., arXiv 2509.13744, every ion rolls up onto its neighbour of highest charge. This draws
-black lines between bright ones, which no measured map shows. With wide responses one run also covers other rules: only
+black lines between bright ones, which no measured map shows. One run also covers other rules: only
 a fraction of the ions rolls up (``probability``), the ion rolls onto a mean of its strongest neighbours
 (``sharpness``), it starts above the surface (``height``), and ions that do not roll up have a lateral energy
 (``others``). The script prints a table and draws the maps of four rules. With ``--full`` the tip has R = 40 a, with
@@ -33,11 +33,11 @@ DRAWN = "unperturbed", "all, strongest neighbour", "all, sharpness 0.15", "60 %,
 
 
 def evaporate(radius, ions):
-    """Run of a nickel tip along [111] with a radius [a], with wide responses."""
+    """Run of a nickel tip along [111] with a radius [a], with responses."""
     nickel = ae.material("Ni")
     size = radius * nickel.a
     tip = ae.Tip(nickel, apex_radius=size, axis=(1, 1, 1), shank_length=2 * size)
-    return ae.Simulation(tip, seed=1, response_settings=ae.ResponseSettings.wide()).run(ions)
+    return ae.Simulation(tip, seed=1).run(ions)
 
 
 def counts(run, perturbation, bins=400):
@@ -47,7 +47,7 @@ def counts(run, perturbation, bins=400):
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--full", action="store_true", help="R = 40 a, 50,000 ions")
-parser.add_argument("--run", metavar="RUN.h5", help="a run with wide responses, instead of a new one")
+parser.add_argument("--run", metavar="RUN.h5", help="a run with responses, instead of a new one")
 parser.add_argument("-o", "--output", metavar="PICTURE.png", help="picture of four maps")
 options = parser.parse_args()
 run = ae.load(options.run) if options.run else evaporate(*((40, 50_000) if options.full else (12, 3_000)))

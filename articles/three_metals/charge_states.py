@@ -1,7 +1,7 @@
 """Charge states by place: the ratio of two charges towards two families of poles and elsewhere.
 
-    python charge_states.py W --ions W_tap.raw RUNS/W_160_others_1_wide.h5 RUNS/W_160_Robin_1.h5
-    python charge_states.py Ni RUNS/Ni_160_others_1_wide.h5 --most 40000
+    python charge_states.py W --ions W_tap.raw RUNS/W_160_others_1_responses.h5 RUNS/W_160_Robin_1.h5
+    python charge_states.py Ni RUNS/Ni_160_others_1_responses.h5 --most 40000
 
 An ion can lose another electron on the first nanometre of its flight. The events of a run are repeated, and the field
 just after each event is taken on the way of its ion, at some heights above its site and its start. Kingham's curves

@@ -1,7 +1,7 @@
 """Measured maps of three metals and those of one law, folded about their poles, beside each other.
 
-python picture.py three_metals.png --W RUNS/W_160_others_1_wide.h5 --Ni RUNS/Ni_160_others_1_wide.h5
-    --Al RUNS/Al_160_others_1_wide.h5
+python picture.py three_metals.png --W RUNS/W_160_others_1_responses.h5 --Ni RUNS/Ni_160_others_1_responses.h5
+    --Al RUNS/Al_160_others_1_responses.h5
 
 The measured maps are the folded densities in measured.npz, made by measured_numbers.py.
 """

@@ -1,6 +1,6 @@
 """How measures of likeness rank ten rules of emission: on the measured maps, and on twins whose rule is known.
 
-    python ranking.py measured W W3.epos RUNS/W_160_others_1_wide.h5
+    python ranking.py measured W W3.epos RUNS/W_160_others_1_responses.h5
     python ranking.py twins Ni RUNS/Ni_160_others_1.h5 RUNS/Ni_160_others_2.h5
 
 Simulated ions are shown on the measured detector by both orientations, nothing is registered. Measures: structural
@@ -24,8 +24,8 @@ SMOOTHING = 0.6  # degrees
 MEASURES = ("SSIM", "SSIM, noise-corrected", "folded correlation", "folded concordance")
 
 
-def wide_rules(metal, scale):
-    """Rules for a run with wide responses; `scale` is the simulated energy per real energy."""
+def rules_of_metal(metal, scale):
+    """Rules for a run with responses; `scale` is the simulated energy per real energy."""
     law = ae.emission.Migration.of(metal.partition("-")[0])
     broad = ae.TruncatedNormal(1.2 * scale, 1.2 * scale)
     return {
@@ -124,7 +124,7 @@ def measured(name, path, run_path):
     target = field_of_view(target, run, orientation, projection)
     own = projection_of(run)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
-    rules = wide_rules(name, scale)
+    rules = rules_of_metal(name, scale)
     crystal = [directions_of(run, own, run.hits(rule), orientation) for rule in rules.values()]
     candidates = [counts_on(target, orientation, projection, each) for each in crystal]
     table = scores(target, candidates, orientation, projection, metal)

@@ -1,7 +1,7 @@
-"""Rules of emission on one run with wide responses, against a measured map: no rule needs a new run.
+"""Rules of emission on one run with responses, against a measured map: no rule needs a new run.
 
-    python runs.py RUNS W 160 --ions 200000 --fly wide
-    python rules.py W W3.epos RUNS/W_160_others_1_wide.h5
+    python runs.py RUNS W 160 --ions 200000 --fly responses
+    python rules.py W W3.epos RUNS/W_160_others_1_responses.h5
 
 The lines of the table are those of `judge.py`. A rule with a threshold rolls up the atoms whose strongest neighbour has
 more than this part of their charge (`ChargeRatio`); the others start from their sites, in random directions. With
@@ -158,8 +158,8 @@ def rules(name, scale):
         )
     found["ratio > 0.66, 0.2 eV, others 0.7 eV"] = rolled(0.2 * scale, probability=threshold, others=0.7 * scale)
     for width in (0.03, 0.1):
-        wide = ae.emission.ChargeRatio(0.66, width)
-        found[f"ratio > 0.66, 0.2 eV, width {width:g}"] = rolled(0.2 * scale, probability=wide)
+        soft = ae.emission.ChargeRatio(0.66, width)
+        found[f"ratio > 0.66, 0.2 eV, width {width:g}"] = rolled(0.2 * scale, probability=soft)
     return found
 
 
@@ -168,7 +168,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("metal", choices=METALS)
     parser.add_argument("measured", help="ions, or a map of densities")
-    parser.add_argument("run", help="with wide responses")
+    parser.add_argument("run", help="with responses")
     parser.add_argument("--rivals", action="store_true", help="rules that are not a threshold")
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)  # tails of the broad energies are extrapolated

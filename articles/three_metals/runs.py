@@ -5,10 +5,10 @@
 One file for each metal, radius, rule and seed, `W_160_others_1.h5`; a file that is there is not made again. All atoms
 evaporate, only ions that can arrive in the measured field of view fly. Every emission is flown for the same ions, in
 the exact field. Energies are 0.35 eV in real units, sigma/mean 1, launches 0.1 nm above the site unless the name says
-otherwise. With --fly wide, each ion gets its responses instead (`_wide.h5`), for any emission afterwards (`rules.py`);
-with --fly law, only the one rule for all metals is flown (`_law.h5`). The responses can also cover roll-ups onto second
-neighbours (--shells 2, `_wide_shells.h5`). With --leave bonds, the field at which an atom leaves depends on its bonds
-to first and second neighbours; with --leave hop, an atom leaves as soon as it can hop.
+otherwise. With --fly responses, each ion gets its responses instead (`_responses.h5`), for any emission afterwards
+(`rules.py`); with --fly law, only the one rule for all metals is flown (`_law.h5`). The responses can also cover
+roll-ups onto second neighbours (--shells 2, `_responses_shells.h5`). With --leave bonds, the field at which an atom
+leaves depends on its bonds to first and second neighbours; with --leave hop, an atom leaves as soon as it can hop.
 """
 
 import argparse
@@ -67,8 +67,8 @@ def prepared(tip, rule, half_angle, skip, seed=1, threads=None, law=None, shells
 
 
 def simulation_of(tip, *, shells, **settings):
-    """Simulation whose responses serve every emission; they record the neighbours for the sharpness."""
-    return ae.Simulation(tip, response_settings=ae.ResponseSettings.wide(shells=shells), **settings)
+    """Simulation whose responses reach so many shells of neighbours."""
+    return ae.Simulation(tip, response_settings=ae.ResponseSettings(shells=shells), **settings)
 
 
 def advanced(tip, half_angle, skip, *, shells=1, **settings):
@@ -89,7 +89,7 @@ def simulated(metal, radius, rule, seed, skip, ions, threads, kind, leave, shell
     tip = ae.Tip(material, size, axis=axis, shank_length=shank, depth=8 * material.a, offset_seed=seed)
     law = LAWS[leave](material)
     simulation, scale = prepared(tip, RULES[rule], half_angle, skip, seed, threads, law, shells)
-    if kind == "wide":
+    if kind == "responses":
         return simulation.run(ions, progress=False)
     rolls = ae.RollUp.of_metal(material, energy_scale=scale)
     flown = [ae.Unperturbed(), rolls] if kind == "law" else emissions(scale)
@@ -107,7 +107,7 @@ def main():
     parser.add_argument("--skip", type=int, default=110_000, help="events before the first ion that flies")
     parser.add_argument("--ions", type=int, default=300_000)
     parser.add_argument("--threads", type=int)
-    kinds = ("emissions", "wide", "law")
+    kinds = ("emissions", "responses", "law")
     parser.add_argument("--fly", choices=kinds, default=kinds[0], help="eight emissions, responses, or the one law")
     parser.add_argument("--shells", type=int, default=1, help="shells of neighbours onto which atoms can roll, 1 or 2")
     parser.add_argument("--leave", choices=LAWS, default="field", help="what decides which atom leaves next")

@@ -12,8 +12,7 @@ def parts(name, events=400):
     metal = ae.material(name)
     length = RADIUS * metal.a
     tip = ae.Tip(metal, apex_radius=length, shank_length=length, axis=AXES[name], offset_seed=1)
-    wide = ae.ResponseSettings.wide()
-    simulation = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential(), response_settings=wide)
+    simulation = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential())
     run = simulation.run(events, progress=False)
     for factor in FACTORS:
         rule = ae.emission.Migration(metal.cohesive_energy, factor * metal.evaporation_field)

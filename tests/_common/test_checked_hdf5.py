@@ -117,7 +117,7 @@ def test_rows_of_a_damaged_column_are_refused(tmp_path):
 
 def test_other_programs_read_it(path, run):
     with h5py.File(path) as file:
-        assert file.attrs["format"] == b"apt_evap run 1"
+        assert file.attrs["format"] == b"apt_evap run 2"
         assert json.loads(file[f"{SIMULATION}/settings"].asstr()[0]) == json.loads(json.dumps(run.settings))
         assert np.array_equal(file[f"{SIMULATION}/fields"], run.fields)
         assert np.array_equal(file[f"{SIMULATION}/history/flagged"], run.history.flagged)
@@ -172,7 +172,7 @@ def test_a_pipe_is_none(tmp_path):
 def test_a_run_of_another_format(path):
     with h5py.File(path, "a") as file:
         file.attrs.create("format", b"apt_evap run 9", dtype=h5py.string_dtype("utf-8", 14))
-    refused(path, "is not a run, but 'run 9'")
+    refused(path, "is a run of format 9, which this version cannot read: repeat the run")
 
 
 # ---- what does not fit ---------------------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ def with_dataset(path, name, values):
         ("fields", lambda values: values.astype("S5"), r"fields must contain float64, got \|S5"),
         ("species", lambda values: values + 9, "species must be 0 to 0"),
         ("species", lambda values: values - 1, "species must be 0 to 0"),
-        ("responses/site", lambda values: values[:, :, :5], r"site must have shape \(60, 3, 15\), got \(60, 3, 5\)"),
+        ("responses/site", lambda values: values[:, :, :5], r"site must have shape \(60, 3, 46\), got \(60, 3, 5\)"),
         ("site", lambda values: values[:-5], r"site must have shape \(60\), got \(55,\)"),
         ("flown/0/times", lambda values: values[:-5], r"times must have shape \(60\), got \(55,\)"),
         ("history/field", lambda values: values[:-1], "field must have shape"),

@@ -42,7 +42,7 @@ EXAMPLES = [
     ae.evaporation.ChargeSettings(tolerance=1e-3, sweep_interval=50),
     ae.simulation.FlightSettings(reach=2000.0),
     ae.ResponseSettings(),
-    ae.ResponseSettings.wide(0.15, shells=2),
+    ae.ResponseSettings(height=0.15, shells=2),
     ae.simulation.Monitor(interval=20),
     ae.Detector(90.0, 80.0, "equidistant"),
     ae.Instrument(dead_time=3.0, quantisation=(0.1, 0.2), timing=ae.detection.Timing(0.3, 50.0)),

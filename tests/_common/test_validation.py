@@ -334,10 +334,12 @@ CASES = [
         "reach bin_width",
         distances=[[NAN, 1.0, 2.0, 3.0]],
     ),
-    row(ae.ResponseSettings),
+    row(ae.ResponseSettings, {}, "height energy_limit bound", height=[0.0, 2.0]),
     row(
         ae.simulation.Design,
-        {"degree": 1, "rings": ((0.0, 1), (1.0, 5))},
+        {"degrees": (1, 0), "rings": ((0.0, 1), (1.0, 5)), "number": 8},
+        degrees=[(1,), (1, 2), (13, 0), (1.5, 0), 3],
+        number=[3, 10**9],
         rings=[[1], [(1.0,)], [(NAN, 5)], [(1.0, 0)], [(1.0, 10**9)], [(1.0, 2)], [("a", 1)]],
     ),
     row(ae.TruncatedNormal, {"mean": 0.1, "standard_deviation": 0.1}),
@@ -535,15 +537,6 @@ CASES = [
         perturbations=[(), (ae.RollUp(0.2),), (ae.RollUp(0.2), "x")],
         weights=[(1.0,), (1.0, -1.0), (1.0, NAN)],
     ),
-    row(
-        ae.simulation.WideDesign,
-        {"place": 1, "velocity": 2, "height": 1, "mixed": 2},
-        place=[7],
-        velocity=[7],
-        height=[7],
-        mixed=[7],
-    ),
-    row(ae.ResponseSettings.wide, {}, "height energy_limit bound", height=[2.0]),
     row(ae.analysis.ImagingGas, {"name": "Xe", "ionisation_energy": 12.13, "field": 15.0}, "ionisation_energy field"),
     row(
         ae.maps.pole_profile,
@@ -922,10 +915,10 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         (ae.emission.IonRandom(1, [0, 1]), ["IonRandom", "seed=1", "2 ions"]),
         (ae.evaporation.ChargeSettings(), ["ChargeSettings", "tolerance=", "opening_angle=0.4"]),
         (ae.simulation.FlightSettings(), ["FlightSettings", "tolerance=", "max_steps=500"]),
-        (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "degree=4"]),
+        (ae.ResponseSettings(), ["energy_limit=1.5", "bound=0.2", "Design((5, 4, 2, 1, 0)"]),
     ]
     for thing, words in told:
         assert all(word in repr(thing) for word in words), repr(thing)
         assert "\n" not in repr(thing) and len(repr(thing)) < 260 and "0x" not in repr(thing)
-    assert repr(run.responses) == "<Responses: 12 ions, 15 coefficients from the site, 10 rolled up>"
+    assert repr(run.responses) == "<Responses: 12 ions, 46 coefficients from the site, 56 rolled up>"
     assert "evaporated atoms" in repr(emitter.evaporate(1))

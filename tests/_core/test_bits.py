@@ -31,7 +31,8 @@ int main(void)
     static double multipoles[MULTIPOLE * N];
     static float row_potential[N], zero[GROUP];
     double potentials[GROUP] = {0}, zeros[GROUP] = {0};
-    double origin[3] = {5, 5, 12}, e[3] = {0}, normal[3] = {0.1, 0.2, 0.97};
+    static float sum[N], product[N];
+    double origin[3] = {5, 5, 12}, e[3] = {0};
     srand48(7);
     for (int i = 0; i < N; i++) {
         fx[i] = x[i] = drand48() * 10, fy[i] = y[i] = drand48() * 10, fz[i] = z[i] = drand48() * 10;
@@ -50,7 +51,9 @@ int main(void)
     bundle_atoms(N - 3, N, columns, GROUP, targets, bundle);
     bundle_cells(N - 3, N, columns, GROUP, targets, bundle);
     weighted_sum(99, N / 100, x, y, 100, totals);
-    patch_row(N, fx, fy, fz, 5, 5, 5, normal, row);
+    patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row);
+    patch_add(N, 0.3, row, sum);
+    patch_product(CELL, N, columns, row, product);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
     for (int i = 0; i < MULTIPOLE * N; i++)
@@ -64,6 +67,7 @@ int main(void)
     patch_potential_and_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, row_potential, px, py, pz);
     add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
+    add(sum, sizeof sum), add(product, sizeof product);
     add(bundle, sizeof bundle), add(totals, 99 * sizeof totals[0]);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);

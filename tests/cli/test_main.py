@@ -803,7 +803,7 @@ def test_a_picture_is_drawn_before_its_file_is_opened(made, folder, monkeypatch)
 
 
 def test_a_table_that_has_no_effect_is_told(folder, capsys):
-    text = SMALL + "responses = false\n[responses]\nwide = true\n"
+    text = SMALL + "responses = false\n[responses]\nheight = 0.1\n"
     (folder / "a.toml").write_text(text.replace("ions = 60", "ions = 5"))
     assert main(["run", "a.toml", "--quiet"]) == 0
     assert "[responses]" in capsys.readouterr().err

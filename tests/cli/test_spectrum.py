@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap import plot
 from apt_evap.cli._files import measured_of
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
+from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read_ranges
+from apt_evap.io.rrng import write_rrng
 
 N, BELOW = 12_000, 6000
 MASSES = {"Ni": (57.9353, 59.9308), "Al": (26.9815,)}
@@ -48,6 +51,19 @@ def test_peaks_are_named_drawn_and_saved(alloy, tmp_path, capsys):
     assert all(abs(counted[element] - N) < 0.03 * N for element in MASSES)
     assert main(["spectrum", str(alloy), "--save", str(saved), "-o", str(picture)]) == 2  # would overwrite ranges
     assert "--force" in capsys.readouterr().err
+
+
+def test_ranges_of_a_file_are_drawn_and_counted(alloy, tmp_path, capsys):
+    names = {"Ni": (57.0, 61.0), "Al": (26.5, 27.5)}
+    low, high = np.array(list(names.values())).T
+    write_rrng(tmp_path / "a.rrng", Ranges(tuple(names), low, high, composition=tuple({name: 1} for name in names)))
+    words = ["spectrum", str(alloy), "--ranges", str(tmp_path / "a.rrng"), "-o", str(tmp_path / "a.png")]
+    assert main([*words, "--json"]) == 0
+    mass = ae.read(alloy).mass_to_charge
+    counted = {name: int(((mass >= low) & (mass < high)).sum()) for name, (low, high) in names.items()}
+    assert json.loads(capsys.readouterr().out)["ions_in_ranges"] == counted
+    ax = plot.spectrum(ae.spectrum(ae.read(alloy)), ranges=read_ranges(tmp_path / "a.rrng"))
+    assert {text.get_text() for text in ax.texts} == set(names)
 
 
 @pytest.mark.parametrize("element", MASSES)

@@ -56,7 +56,7 @@ EVERY_KEY = {
         "start_tolerance": 1e-6,
     },
     "flights": {"opening_angle": 0.4, "tolerance": 1e-2, "reach": 5000.0, "max_steps": 400},
-    "responses": {"energy_limit": 1.0, "bound": 0.1, "wide": False, "shells": 2},
+    "responses": {"energy_limit": 1.0, "bound": 0.1, "height": 0.1, "shells": 2},
     "maps": {
         "bins": 40,
         "smoothing": 2,

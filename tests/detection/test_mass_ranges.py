@@ -182,6 +182,10 @@ def test_every_ion_is_in_the_first_range_that_holds_it(bounds, masses):
         ((["a"], [2.0], [1.0]), "low must be < high .* 2 to 1 for 'a'"),
         ((["a"], [1.0, 2.0], [3.0, 4.0]), r"low must have shape \(1,\)"),
         ((["a"], [1.0], [2.0], None, ["#FFFFFF"] * 2), "colour must have one entry"),
+        ((["Si\n[Ranges]"], [1.0], [2.0]), "names of species must be text of 1 to 100 printable"),
+        (([""], [1.0], [2.0]), "names of species must be text of 1 to 100 printable"),
+        ((["a"], [1.0], [2.0], None, ["FF\nRange9=1 2"]), "colour must be text of 1 to 100 printable"),
+        ((["a"], [1.0], [2.0], None, None, [{"S\ni": 1}]), "elements of a composition must be text of 1 to 100"),
     ],
 )
 def test_bad_ranges_are_named(arguments, problem):

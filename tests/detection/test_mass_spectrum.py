@@ -64,6 +64,18 @@ def test_flight_length_and_time_zero_are_found_within_three_errors(ions, distanc
     assert {peak.name for peak in result.peaks} == {f"{f}{c if c > 1 else ''}+" for f, c in ions}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("time_zero", [0.0, 5.0])
+@pytest.mark.parametrize("voltages", [(5000, 5001), (4000, 6000)])
+@pytest.mark.parametrize("aluminium", [{("Al", 1): 3}, {("Al", 2): 3}, {("Al", 2): 2, ("Al", 1): 1}])
+def test_peaks_of_other_ions_are_not_taken_for_those_of_the_element(aluminium, voltages, time_zero):
+    """Si2+ and N2+ are 4 % beside Al2+ and Al+, with twice as many ions."""
+    ions = aluminium | {("Si", 2): 4, ("N2", 1): 3}
+    result = ae.spectrum(recorded(ions, 90.0, time_zero, voltages), "Al", distance=90.9)
+    assert abs(result.flight.distance - 90.0) < 0.3 and abs(result.flight.time_zero - time_zero) < 1.5
+    assert {peak.name for peak in result.peaks} == {f"Al{charge if charge > 1 else ''}+" for _, charge in aluminium}
+
+
 def test_one_charge_state_gives_a_factor_only():
     hits = recorded({("W", 3): 1}, 310.0, 30.0, (9000, 9100))
     fit = ae.spectrum(hits, "W", distance=305.0).flight

@@ -73,9 +73,9 @@ def test_unknown_targets_are_refused(emissions):
     del columns["targets"], columns["charge_ratios"]
     without = Emissions(**columns, nearest_neighbour_distance=0.25)
     assert roll_ups(without).possible.any()
-    with pytest.raises(ValueError, match="wide"):
+    with pytest.raises(ValueError, match="the `targets` and `charge_ratios` of the emissions"):
         roll_ups(without, 0.2)
-    with pytest.raises(ValueError, match="wide"):
+    with pytest.raises(ValueError, match="the `targets` and `charge_ratios` of the emissions"):
         rollup_direction(without, np.full((500, 3), 1 / 3))
 
 

@@ -226,14 +226,15 @@ def test_only_the_address_opens_the_page(served):
 
 
 def test_from_the_start_page(tmp_path):
-    """A dropped file is copied into the folder and opened; the example is a click away."""
+    """A dropped file is copied into the folder and opened, on any page; the example is a click away."""
     content = tmp_path / "elsewhere"
     content.mkdir()
     rng = np.random.default_rng(1)
-    ae.write(content / "dropped.epos", ae.Hits(x=rng.normal(size=500), y=rng.normal(size=500)))
-    drop = """bytes => {
+    for name, n in (("dropped.epos", 500), ("second.epos", 400)):
+        ae.write(content / name, ae.Hits(x=rng.normal(size=n), y=rng.normal(size=n)))
+    drop = """([name, bytes]) => {
       const transfer = new DataTransfer()
-      transfer.items.add(new File([new Uint8Array(bytes)], "dropped.epos"))
+      transfer.items.add(new File([new Uint8Array(bytes)], name))
       document.dispatchEvent(new DragEvent("drop", {dataTransfer: transfer, cancelable: true}))
     }"""
     shown = "[...Bokeh.documents[0].all_models].some(m => m.type == 'Div' && m.text.includes('%s'))"
@@ -241,8 +242,9 @@ def test_from_the_start_page(tmp_path):
     with explorer_in(tmp_path / "work") as url, opened(url) as page:
         page.get_by_text("Drop a measured file").wait_for()
         picture(page, "start")
-        page.evaluate(drop, list((content / "dropped.epos").read_bytes()))
-        page.wait_for_function(shown % "<b>dropped.epos</b> 500 ions")
+        for name, n in (("dropped.epos", 500), ("second.epos", 400)):
+            page.evaluate(drop, [name, list((content / name).read_bytes())])
+            page.wait_for_function(shown % f"<b>{name}</b> {n} ions")
         assert page.errors == []
     assert (tmp_path / "work" / "dropped.epos").read_bytes() == (content / "dropped.epos").read_bytes()
     with explorer_in(tmp_path / "work") as url, opened(url) as page:

@@ -21,7 +21,8 @@ from apt_evap.explore import background_run, index_panel
 from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.index_panel import IndexPanel
 from apt_evap.explore.page import Page
-from apt_evap.explore.run_panel import RunPanel, ServerState
+from apt_evap.explore.run_panel import RunPanel
+from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.search_process import ProcessEnded, SearchProcess
 
 SECONDS = 120  # until a test gives up: the machine may be busy

@@ -1,8 +1,10 @@
 """The start page of the explorer: files of the folder, files that were opened last, an example, and a dropped file."""
 
+import time
 from pathlib import Path
 from urllib.parse import urlencode
 
+import numpy as np
 import pytest
 
 import apt_evap as ae
@@ -14,8 +16,10 @@ from bokeh.events import ButtonClick
 from bokeh.util.token import generate_session_id
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
+from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import recent_files, remember_file
+from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.server import serve
 from apt_evap.explore.start_page import EXAMPLE, StartPage, write_example
 
@@ -26,6 +30,8 @@ def folder(tmp_path, monkeypatch):
     for name in ("a.epos", "b.raw", "run.h5", "notes.txt", "w.toml"):
         (tmp_path / name).write_bytes(b"12345")
     (tmp_path / "inside").mkdir()
+    (tmp_path / "inside" / "ni.toml").write_text('[tip]\nmaterial = "Ni"\n[simulation]\nions = 10\n')
+    (tmp_path / "study.toml").write_text("[study]\n[tip]\n")
     (tmp_path / "inside" / "c.npz").write_bytes(b"1")
     (tmp_path / "folder.epos").mkdir()
     return tmp_path
@@ -35,17 +41,56 @@ def test_the_files_of_the_folder_are_opened(folder):
     asked = []
     remember_file("b.raw")
     remember_file("gone.raw")
-    start = StartPage(asked.append)
-    names = ["a.epos", "b.raw", "inside/c.npz", "run.h5", str(folder / "b.raw"), EXAMPLE]
+    start = StartPage(asked.append, ServerState(), lambda function, delay: None)
+    names = ["a.epos", "b.raw", "inside/c.npz", "run.h5", "inside/ni.toml", str(folder / "b.raw"), EXAMPLE]
     assert [Path(name) for name in start.buttons] == [Path(name) for name in names]
-    for button in start.buttons.values():
-        button._trigger_event(ButtonClick(button))
-    assert asked == list(start.buttons)
-    start.dropped.value = "d.epos"
-    assert asked[-1] == "d.epos"
+    names = [name for name in start.buttons if not name.endswith(".toml")]
+    for name in names:
+        start.buttons[name]._trigger_event(ButtonClick(start.buttons[name]))
+    assert asked == names
     page = Page(None, Document(), opened=lambda path, document: lambda: None)
     assert set(page.start.buttons) == set(start.buttons)
     page.document.validate()
+    page.close()
+
+
+def test_settings_of_the_folder_are_run(folder, monkeypatch):
+    """A click starts the run of a settings file; its run is opened at its end, another one waits until then."""
+    runs, calls, asked = [], [], []
+
+    class Run:
+        def __init__(self, settings, output):
+            self.active, self.finished, self.message, self.ions, self.n_ions = True, False, "", 5, 10
+            self.seconds_left, self.output = None, output
+            runs.append((settings, output))
+
+    monkeypatch.setattr("apt_evap.explore.run_progress.BackgroundRun", Run)
+    state = ServerState()
+    start = StartPage(asked.append, state, lambda function, delay: calls.append(function))
+    (button,) = (button for path, button in start.buttons.items() if path.endswith(".toml"))
+    for _ in range(2):
+        button._trigger_event(ButtonClick(button))
+    assert runs == [(folder / "inside" / "ni.toml", folder / "inside" / "ni.h5")]
+    assert "active" in start.text.text and start.stop.visible
+    calls.pop()()
+    assert "5 of 10 ions" in start.text.text
+    state.run.active, state.run.finished = False, True
+    calls.pop()()
+    assert asked == [str(folder / "inside" / "ni.h5")] and not start.stop.visible
+
+
+@pytest.mark.parametrize("page_of", [lambda **more: None, lambda **more: Explorer(None, ae.Hits(**more))])
+def test_a_file_can_be_dropped_on_every_page(folder, page_of):
+    asked = []
+    explorer = page_of(x=np.arange(9.0), y=np.arange(9.0) ** 2)
+    page = Page(explorer, Document(), opened=lambda path, document: asked.append(path) or (lambda: None))
+    page.document.get_model_by_name("dropped").value = "d.epos"
+    for _ in range(100):
+        if asked:
+            break
+        time.sleep(0.05)
+    assert asked == ["d.epos"]
+    assert page.document.get_model_by_name("told of a dropped file") is not None
     page.close()
 
 

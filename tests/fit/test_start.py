@@ -12,7 +12,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import read_config
-from apt_evap.fit.start_settings import FIELD_FACTOR, MARK
+from apt_evap.fit.start_settings import FIELD_FACTOR, MARK, registration_start_of
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.master_pattern import master_patterns
 
@@ -49,6 +49,19 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
         assert f"{ae.emission.Migration(4.44, field).threshold:.2f}" in start.text
     assert all("#" in line for line in start.text.splitlines() if line.startswith(("axis", "rotation", "apex", "ions")))
     assert np.isnan(start.radii).all() and "no voltages" in start.text
+
+
+def test_the_place_of_a_run_is_that_of_its_settings(found, tmp_path):
+    """The registration of a run begins where its settings say, on the map that they were made from only."""
+    _, indexing = found
+    map = replace(indexing.map, source="folder/W.npz")
+    start = ae.fit.settings_of(replace(indexing, map=map), minutes=1)
+    start.save(tmp_path / "w.toml")
+    read, made = registration_start_of(tmp_path / "w.toml", replace(map, source="W.npz")), start.registration
+    assert read.keys() == made.keys() and read["scales"] == made["scales"] and read["rotations"] == made["rotations"]
+    assert read["tolerance"] == pytest.approx(made["tolerance"], rel=1e-3)
+    assert read["start"].shift == pytest.approx(made["start"].shift, abs=0.01)
+    assert registration_start_of(tmp_path / "w.toml", replace(map, source="Mo.npz")) == {}
 
 
 def test_results_have_short_representations(found):

@@ -833,7 +833,7 @@ def test_pictures(twin, tmp_path):
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # tails of the energies
 def test_the_rule_of_the_metal_is_a_baseline_that_finds_its_own_map():
     tip = ae.Tip("Ni", apex_radius=3.5, axis=(1, 1, 1), shank_length=3.5, offset_seed=1)
-    responses = ae.ResponseSettings.wide(energy_limit=4.0)
+    responses = ae.ResponseSettings(energy_limit=4.0)
     run = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential(), response_settings=responses).run(
         1_500, progress=False
     )

@@ -194,6 +194,16 @@ def test_maps_that_have_nothing_in_common(simulated):
 
 
 @pytest.mark.slow
+def test_a_registration_by_few_hits_is_not_tried(rng):
+    """A magnified rim of a map, of which some hits are on the measured one, fits anything by chance."""
+    few, many = (20 * np.sqrt(rng.random(n)) * np.exp(2j * np.pi * rng.random(n)) for n in (4_000, 20_000))
+    with pytest.warns(RegistrationWarning):
+        found = register(*(ae.Hits(x=z.real, y=z.imag) for z in (few, many)), rotations=(0, 12), mirrors=[False])
+    x, y = found.points(few.real, few.imag)
+    assert np.count_nonzero(np.hypot(x, y) < 20) >= 900  # within the rim of the map
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(not NICKEL.exists(), reason="the measured map of nickel is not there")
 @pytest.mark.filterwarnings("ignore:the registration is doubtful")
 def test_measured_nickel(run20):

@@ -59,7 +59,7 @@ def test_nothing_is_loaded(seen):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
 def test_options_of_the_perturbation_are_in_the_report(small_tip, tmp_path):
-    settings = {**ROUGH, "response_settings": ae.ResponseSettings.wide(bound=5.0)}
+    settings = {**ROUGH, "response_settings": ae.ResponseSettings(bound=5.0)}
     run = ae.Simulation(small_tip, seed=1, **settings).run(400, progress=False)
     measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
     study = fit_energies(

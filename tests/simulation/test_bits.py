@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "9ab4c31cd309fa4185299e41475db31ad6af0ee18429e64f79011b15110e6bb2"
+FINGERPRINT = "58a76daa6fe3ecaafae894cb86473b8bac1972abd8a0db03fc247df4af5e1c5c"
 PROGRAM = """
 import warnings
 

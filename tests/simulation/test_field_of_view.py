@@ -19,16 +19,10 @@ EMISSIONS = (
     ae.RollUp(1.5),
     ae.RollUp(ae.TruncatedNormal(0.3, 0.1)),
     ae.Combined(1.5, 0.5),
-)
-WIDE = (
     ae.LateralVelocity(1.5, height=0.2),
     ae.RollUp(1.5, sharpness=1.0, height=0.2),
     ae.Combined(1.5, 0.5, probability=0.5, sharpness=0.1),
 )
-KINDS = {
-    "linear": (ae.ResponseSettings(), EMISSIONS),
-    "wide": (ae.ResponseSettings.wide(), EMISSIONS + WIDE),
-}
 
 
 @pytest.fixture(scope="module")
@@ -47,15 +41,15 @@ def simulate(tip, n=400, field_of_view=None, detector=DETECTOR, **options):
 
 
 @pytest.fixture(scope="module")
-def wide_all(tips):
-    """All ions of the alloy, with wide responses."""
-    return simulate(tips["alloy"], response_settings=KINDS["wide"][0])
+def every_ion(tips):
+    """All ions of the alloy."""
+    return simulate(tips["alloy"])
 
 
 @pytest.fixture(scope="module")
-def wide_part(tips):
+def part_of_view(tips):
     """The same ions in a field of view of 20 degrees."""
-    return simulate(tips["alloy"], field_of_view=20.0, response_settings=KINDS["wide"][0])
+    return simulate(tips["alloy"], field_of_view=20.0)
 
 
 def polar_angles(hits):
@@ -67,19 +61,17 @@ def polar_angles(hits):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
-@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["nickel", "alloy"])
-def test_no_ion_that_arrives_is_lost(tips, kind, name):
-    settings, emissions = KINDS[kind]
-    every = simulate(tips[name], response_settings=settings)
+def test_no_ion_that_arrives_is_lost(tips, name):
+    every = simulate(tips[name])
     angle = 20.0
-    part = simulate(tips[name], field_of_view=angle, response_settings=settings)
+    part = simulate(tips[name], field_of_view=angle)
     flown = ~part.not_flown
     assert 0.2 < part.not_flown.mean() < 0.9
     for array in ("site", "rolled", "residuals"):
         np.testing.assert_array_equal(getattr(part.responses, array)[flown], getattr(every.responses, array)[flown])
         assert np.isnan(getattr(part.responses, array)[~flown]).all()
-    for perturbation in emissions:
+    for perturbation in EMISSIONS:
         expected, hits = every.hits(perturbation), part.hits(perturbation)
         inside = polar_angles(expected) <= angle
         # 400 mm at 100 mm contain the whole field of view
@@ -90,8 +82,8 @@ def test_no_ion_that_arrives_is_lost(tips, kind, name):
             assert np.isnan(getattr(hits, column)[~inside]).all()
 
 
-def test_scouts_are_among_the_launches_of_the_responses(wide_all):
-    settings, emissions = KINDS["wide"][0], wide_all.emissions
+def test_scouts_are_among_the_launches_of_the_responses(every_ion):
+    settings, emissions = every_ion.response_settings, every_ion.emissions
     scouts = scouts_of(emissions, settings)
     assert scouts.positions.shape == scouts.velocities.shape == (len(emissions), 8, 3)
     assert scouts.families.tolist() == [3, 5]
@@ -102,7 +94,7 @@ def test_scouts_are_among_the_launches_of_the_responses(wide_all):
     assert np.abs((scouts.velocities * emissions.normals[:, None]).sum(axis=2)).max() < 1e-12
 
 
-def test_the_prediction_is_needed(tips, wide_all, monkeypatch):
+def test_the_prediction_is_needed(tips, every_ion, monkeypatch):
     """Without it, with the flight at rest from the site alone and no margin, ions are lost."""
 
     def at_rest(emissions, settings):
@@ -115,15 +107,15 @@ def test_the_prediction_is_needed(tips, wide_all, monkeypatch):
 
     monkeypatch.setattr("apt_evap.simulation.simulation.scouts_of", at_rest)
     monkeypatch.setattr("apt_evap.simulation.flight.flight_pool.LEAST_MARGIN", 0.0)
-    part = simulate(tips["alloy"], field_of_view=20.0, response_settings=KINDS["wide"][0])
-    inside = polar_angles(wide_all.hits(ae.RollUp(1.5))) <= 20.0
+    part = simulate(tips["alloy"], field_of_view=20.0)
+    inside = polar_angles(every_ion.hits(ae.RollUp(1.5))) <= 20.0
     assert np.count_nonzero(inside & part.not_flown) > 10
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("energy_limit", [0.3, 4.0])
 def test_the_margin_follows_the_energy_limit(tips, energy_limit):
-    settings = ae.ResponseSettings.wide(energy_limit=energy_limit)
+    settings = ae.ResponseSettings(energy_limit=energy_limit)
     every = simulate(tips["nickel"], response_settings=settings)
     part = simulate(tips["nickel"], field_of_view=15.0, response_settings=settings)
     with warnings.catch_warnings():
@@ -163,15 +155,15 @@ def test_bits_do_not_depend_on_threads_batches_and_interruptions(tips, tmp_path)
         ae.Simulation(tips["alloy"], **settings).run(200, checkpoint=ae.simulation.Checkpoint(path, resume=True))
 
 
-def test_ions_are_counted(wide_part):
-    summary = wide_part.summary()
-    hits = wide_part.hits(ae.Unperturbed())
-    assert summary["outside"] == hits.counts[Outcome.OUTSIDE] == len(wide_part) - summary["hit"]
-    assert summary["not_flown"] == wide_part.not_flown.sum() < summary["outside"]
-    assert not wide_part.flagged[wide_part.not_flown].any()
-    assert wide_part[:50].not_flown.sum() == wide_part.not_flown[:50].sum()
+def test_ions_are_counted(part_of_view):
+    summary = part_of_view.summary()
+    hits = part_of_view.hits(ae.Unperturbed())
+    assert summary["outside"] == hits.counts[Outcome.OUTSIDE] == len(part_of_view) - summary["hit"]
+    assert summary["not_flown"] == part_of_view.not_flown.sum() < summary["outside"]
+    assert not part_of_view.flagged[part_of_view.not_flown].any()
+    assert part_of_view[:50].not_flown.sum() == part_of_view.not_flown[:50].sum()
     assert len(hits[hits.detected]) == summary["hit"] == hits.map(bins=20).ions
-    assert f"{summary['not_flown']} ions not flown" in repr(wide_part)
+    assert f"{summary['not_flown']} ions not flown" in repr(part_of_view)
 
 
 def test_perturbations_with_their_own_flights_are_flown_for_all_ions(tips):
@@ -196,8 +188,8 @@ def test_ions_that_never_leave_are_not_outside(tips):
     assert run.summary()["never_left"] == 20 and not run.not_flown.any()
 
 
-def test_real_units_keep_the_field_of_view(wide_all, wide_part):
-    expected, found = (run.at_evaporation_field() for run in (wide_all, wide_part))
+def test_real_units_keep_the_field_of_view(every_ion, part_of_view):
+    expected, found = (run.at_evaporation_field() for run in (every_ion, part_of_view))
     np.testing.assert_array_equal(found.voltages, expected.voltages)
     perturbation = ae.RollUp(0.1)
     expected, hits = (run.hits(perturbation) for run in (expected, found))
@@ -234,20 +226,20 @@ def test_polar_angles_of_a_detector():
     assert stereographic_rim(90.0) == pytest.approx(1.0, rel=1e-15)
 
 
-def test_a_detector_that_sees_more_is_warned_about(wide_part):
+def test_a_detector_that_sees_more_is_warned_about(part_of_view):
     with pytest.warns(RunWarning, match="field of view"):
-        seen = wide_part.on_detector(ae.Detector(distance=50.0, width=80.0))
+        seen = part_of_view.on_detector(ae.Detector(distance=50.0, width=80.0))
     assert seen.hits(ae.Unperturbed()).extent is None  # an outline follows from the ions, as of measured ones
-    grid = wide_part.grid(40)
+    grid = part_of_view.grid(40)
     x = (grid.x_edges[1:] + grid.x_edges[:-1]) / 2
     np.testing.assert_array_equal(grid.mask, np.hypot(*np.meshgrid(x, x)) <= 100.0 * np.tan(np.radians(20.0)))
-    assert wide_part.hits(ae.RollUp(1.5)).map(like=grid).ions > 30
-    real = wide_part.at_evaporation_field()
+    assert part_of_view.hits(ae.RollUp(1.5)).map(like=grid).ions > 30
+    real = part_of_view.at_evaporation_field()
     with pytest.warns(RunWarning, match="field of view"):
         real.record(ae.Instrument(distance=100.0, field_of_view=80.0))
     with warnings.catch_warnings():
         warnings.simplefilter("error", RunWarning)
-        seen = wide_part.on_detector(ae.Detector(distance=100.0, width=50.0))
+        seen = part_of_view.on_detector(ae.Detector(distance=100.0, width=50.0))
         assert seen.hits(ae.Unperturbed()).extent == (-25.0, 25.0, -25.0, 25.0)
         recorded = real.record(ae.Instrument(distance=100.0, field_of_view=70.0), ae.RollUp(0.1))
     assert len(recorded) and np.isfinite(recorded.x).all()

@@ -29,52 +29,70 @@ FLOWN = (
 def test_designs_fix_their_polynomials(name):
     design = getattr(ae.ResponseSettings(), name)
     matrix = design.monomials(design.launches)
-    coefficients = (design.degree + 1) * (design.degree + 2) // 2
-    assert matrix.shape == (sum(count for _, count in design.rings), coefficients)
-    assert np.linalg.matrix_rank(matrix) == coefficients
-    assert len(matrix) > coefficients  # some are left over, to tell a bad fit
-    assert np.linalg.cond(matrix) < 100  # errors of the flights are not blown up
-    assert np.hypot(*design.launches.T).max() == pytest.approx(1.0)
+    assert len(matrix) == design.number == len(np.unique(design.launches, axis=0))
+    assert np.linalg.matrix_rank(matrix) == matrix.shape[1] == len(np.unique(design.exponents, axis=0))
+    assert len(matrix) > 1.3 * matrix.shape[1]  # some are left over, to tell a bad fit
+    assert np.linalg.cond(matrix) < 2000  # coefficients in single precision lose about three of seven digits
+    velocities = design.launches[:, -3:-1]
+    assert np.hypot(*velocities.T).max() == pytest.approx(1.0)
+    # the first launches are those of most rules: the velocities of the rings
+    first = sum(number for _, number in design.rings)
+    assert not design.launches[:first, [*range(design.launches.shape[1] - 3), -1]].any()
+    np.testing.assert_allclose(np.hypot(*velocities[:first].T), np.repeat(*zip(*design.rings, strict=True)), atol=1e-15)
+
+
+def test_monomials_are_those_of_the_degrees():
+    design = ae.simulation.Design((3, 2, 1, 0), ((0.0, 1), (0.6, 5), (1.0, 7)), 78, place=True)
+    totals = np.sum(design.exponents, axis=1)
+    assert totals.max() == 3 and len(totals) == 56  # of total degree 3 in five variables
+    design = ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 6)), 8)
+    assert {tuple(row) for row in design.exponents.tolist()} == {
+        (0, 0, 0), (1, 0, 0), (0, 1, 0), (2, 0, 0), (1, 1, 0), (0, 2, 0), (0, 0, 1),
+    }  # fmt: skip
 
 
 def test_a_design_that_fixes_nothing_is_refused():
-    with pytest.raises(ValueError, match="must determine the 6 coefficients of degree 2"):
-        ae.simulation.Design(2, ((0.0, 1), (1.0, 4)))  # five launches for six numbers
+    with pytest.raises(ValueError, match="must determine the 7 coefficients"):
+        ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 4)), 6)  # six launches for seven numbers
     with pytest.raises(ValueError, match="must determine"):
-        ae.simulation.Design(2, ((1.0, 12),))  # on a circle u^2 + v^2 = 1 adds nothing
-    ae.simulation.Design(2, ((0.0, 1), (1.0, 5)))
+        ae.simulation.Design((2, 0), ((1.0, 12),), 24)  # on a circle u^2 + v^2 = 1 adds nothing
+    with pytest.raises(
+        ValueError, match="number must be at most 12, the launches of the grid of these degrees and rings"
+    ):
+        ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 5)), 13)
+    ae.simulation.Design((2, 0), ((0.0, 1), (1.0, 5)), 7)
 
 
 @given(
     degree=st.integers(0, 4),
-    coefficients=arrays(np.float64, (2, 3, 15), elements=st.floats(-1, 1)),
+    coefficients=arrays(np.float64, (2, 3, 16), elements=st.floats(-1, 1)),
     seed=st.integers(0, 1000),
 )
 def test_polynomials_are_found_again(degree, coefficients, seed):
-    design = ae.simulation.Design(degree, ((0.0, 1), (0.5, 11), (1.0, 13)))
-    coefficients = coefficients[:, :, : (degree + 1) * (degree + 2) // 2]
+    design = ae.simulation.Design((degree, 0), ((0.0, 1), (0.5, 11), (1.0, 13)), 40)
+    exponents = design.exponents
+    coefficients = coefficients[:, :, : len(exponents)]
     values = np.einsum("mc,nkc->nmk", design.monomials(design.launches), coefficients)
     fitted, residual = design.fit(values)
-    # coefficients are kept in float32: half of 2^-23 of 1, and twice that by the 15 columns of the fit
+    # coefficients are kept in float32: half of 2^-23 of 1, and twice that by the 16 columns of the fit
     assert np.abs(fitted - coefficients).max() < 2e-7
     assert residual.max() < 1e-12
-    velocities = np.random.default_rng(seed).uniform(-1, 1, (2, 2))
-    u, v = velocities.T
-    expected = np.zeros((2, 3))
-    column = 0
-    for total in range(degree + 1):
-        for j in range(total + 1):
-            expected += coefficients[:, :, column] * (u ** (total - j) * v**j)[:, None]
-            column += 1
-    assert np.abs(design.evaluate(fitted, velocities) - expected).max() < 15 * 2e-7
+    variables = np.random.default_rng(seed).uniform(-1, 1, (2, 3))
+    expected = np.einsum("nc,nkc->nk", np.prod(variables[:, None] ** exponents, axis=2), coefficients)
+    assert np.abs(design.evaluate(fitted, variables) - expected).max() < 16 * 2e-7
 
 
-def test_the_residual_is_that_of_the_fit():
-    design = ae.simulation.Design(1, ((0.0, 1), (1.0, 8)))
-    u, v = design.launches.T
-    values = np.stack([u * u - v * v, 2 * u * v, u], axis=1)[None]  # the first two are none of 1, u, v
-    _, residual = design.fit(values)
-    assert residual[0] == pytest.approx(np.sqrt(8 / (9 - 3)))  # eight launches off by 1, nine less three free
+def test_the_fit_is_weighted_least_squares():
+    """Launches without a height count three times as much as the others."""
+    design = ae.simulation.Design((1, 0), ((0.0, 1), (1.0, 8)), 16)
+    values = np.random.default_rng(1).normal(size=(2, 16, 3))
+    weights = np.where(np.arange(16) < 9, 3.0, 1.0)
+    matrix = design.monomials(design.launches)
+    expected = np.linalg.lstsq(matrix * weights[:, None], values[0] * weights[:, None], rcond=None)[0]
+    fitted, residual = design.fit(values)
+    np.testing.assert_allclose(fitted[0], expected.T, atol=1e-6)
+    misfits = (matrix @ expected - values[0])[:, :2]
+    assert residual[0] == pytest.approx(np.sqrt((misfits**2).sum() / (16 - 4)), rel=1e-6)
 
 
 # ---- what is fitted ------------------------------------------------------------------------------------------------
@@ -164,9 +182,12 @@ def test_higher_degree_is_better(tip12):
     """What the polynomials leave over shrinks with their degree."""
     perturbation = ae.Combined(WIDE, 0.25)
     errors = []
+    rings = (0.0, 1), (0.55, 7), (1.0, 9)
     for degree in (1, 2, 3):
-        design = ae.simulation.Design(degree, ((0.0, 1), (0.55, 7), (1.0, 9)))
-        settings = ae.ResponseSettings(site=design, rolled=design)
+        degrees = tuple(range(degree, -1, -1))
+        site = ae.simulation.Design(degrees, rings, 30)
+        rolled = ae.simulation.Design(degrees, rings, 80, place=True)
+        settings = ae.ResponseSettings(site=site, rolled=rolled)
         run = ae.Simulation(tip12, seed=3, response_settings=settings).run(100, [perturbation], progress=False)
         flown, by_response = run.hits(perturbation), replace(run, perturbations=(), flown=()).hits(perturbation)
         errors.append(np.nanmedian(np.hypot(flown.x - by_response.x, flown.y - by_response.y)))
@@ -184,12 +205,12 @@ def test_bad_fits_are_flagged(run):
 
 def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
     """Ions at a wide angle meet an equidistant detector though one of their launches flies away from its plane."""
-    design = ae.simulation.Design(1, ((0.0, 1), (1.0, 4)))
-    values = np.zeros((2, 5, 3))
+    design = ae.simulation.Design((1, 0), ((0.0, 1), (1.0, 4)), 7)
+    values = np.zeros((2, 7, 3))
     values[:, :, 0] = design.launches[:, 0]
     values[:, :, 2] = 100.0
     values[1, 2, 2] = np.inf
     coefficients, residual = design.fit(values)
     assert np.isfinite(coefficients).all()
     assert residual[0] < 1e-12 and np.isinf(residual[1])  # which flags the ion
-    assert coefficients[1, 2] == pytest.approx([100.0, 0.0, 0.0], abs=1e-4)
+    assert coefficients[1, 2] == pytest.approx([100.0, 0.0, 0.0, 0.0], abs=1e-4)

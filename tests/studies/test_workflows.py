@@ -68,7 +68,7 @@ def test_a_simulated_file_is_extended_and_nobody_elses_is_replaced(folder):
 
 @NO_PICTURES
 def test_what_to_know_about_a_run_is_a_warning(folder):
-    Path("small.toml").write_text(SMALL + "responses = false\n[responses]\nwide = true\n[detector]\nwidth = 300\n")
+    Path("small.toml").write_text(SMALL + "responses = false\n[responses]\nheight = 0.1\n[detector]\nwidth = 300\n")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         ae.simulate("small.toml", ions=10, progress=False)

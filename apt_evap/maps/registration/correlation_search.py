@@ -1,6 +1,6 @@
 """Search for the transform of one map onto another: flattened images, masked correlations, refinement."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -20,6 +20,8 @@ NARROW = 0.8
 """Standard deviation of the Gaussian that smooths maps, in pixels."""
 RIM = 0.03
 """Width of the excluded rim of the field of view, in its diameters."""
+FEWEST = 1000
+"""Simulated hits on the measured map below which a registration is not searched: six in each patch of the search."""
 ROTATION_STEP, SCALE_STEP = 6.0, 0.1
 """Steps of the search, in rotation [degrees] and in the logarithm of the scale: about two coarse pixels at the rim."""
 
@@ -210,13 +212,27 @@ def search(
     return sorted(fits, key=lambda fit: -fit.rank)
 
 
-def distinct(fits: Sequence[Fit], n_max: int) -> list[Fit]:
+def distinct(fits: Iterable[Fit], n_max: int) -> list[Fit]:
     """The first `n_max` fits that are not close to a better one in rotation and scale."""
-    best = []
+    best: list[Fit] = []
     for fit in fits:
-        if len(best) < n_max and not any(_close(fit.transform, other.transform) for other in best):
+        if len(best) == n_max:
+            break
+        if not any(_close(fit.transform, other.transform) for other in best):
             best.append(fit)
     return best
+
+
+def hits_on(simulated: View, measured: View, transform: SimilarityTransform) -> float:
+    """Number of simulated hits that a transform puts into the measured field of view, of a map of counts (float)."""
+    x, y = np.meshgrid(*simulated.map.centres)
+    place = transform.apply((x + 1j * y)[simulated.mask])
+    left, _, lower, _ = measured.map.extent
+    width, height = measured.map.bin_size
+    columns, rows = np.floor((place.real - left) / width), np.floor((place.imag - lower) / height)
+    inside = (rows >= 0) & (columns >= 0) & (rows < measured.mask.shape[0]) & (columns < measured.mask.shape[1])
+    inside[inside] = measured.mask[rows[inside].astype(int), columns[inside].astype(int)]
+    return float(simulated.map.values[simulated.mask][inside].sum())
 
 
 def refine(

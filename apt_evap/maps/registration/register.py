@@ -25,6 +25,7 @@ from apt_evap._common.validation import (
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.maps.registration.correlation_search import (
+    FEWEST,
     FINE,
     MEDIUM,
     NARROW,
@@ -33,6 +34,7 @@ from apt_evap.maps.registration.correlation_search import (
     ShiftBounds,
     View,
     distinct,
+    hits_on,
     refine,
     search,
 )
@@ -273,7 +275,7 @@ def register(
     scales : float or tuple of float, optional
         Scale, or its lower and upper bound [measured mm per simulated mm], known for example from angles between poles.
         By default the simulated map covers at least half of the measured area, and the measured map at least 1/25 of
-        the simulated area.
+        the simulated area and 1,000 simulated hits (or a quarter of them all): fewer fit anywhere by chance.
     mirrors : sequence of bool, optional
         Whether to try the simulated map unmirrored, mirrored, or both: (False, True), the default.
     overlap : float
@@ -331,7 +333,8 @@ def register(
     shift_bounds = _shift_bounds(start, pole, tolerance, measured)
     rotations, scales, mirrors = _transform_bounds(start, rotations, scales, mirrors)
     ratio = measured.diameter / simulated.diameter
-    scale_range = (np.sqrt(0.5) * ratio, 5 * ratio) if scales is None else scales
+    fewest = _fewest_hits(simulated) if scales is None else 0.0
+    scale_range = _default_scales(simulated, fewest, ratio) if scales is None else scales
 
     # all transforms on a grid of rotations and scales, with the best shift of each
     angles = np.arange(0, 360, ROTATION_STEP) if rotations is None else _steps(rotations, ROTATION_STEP)
@@ -346,7 +349,20 @@ def register(
 
     # the best of them refined with few pixels, then with many; those within the noise of the best one are ties
     bounds = rotations, scales, shift_bounds
-    fits = [refine(simulated, measured, fit.transform, MEDIUM, least, *bounds) for fit in distinct(fits, _MAX_FITS)]
+
+    def shown(fit):
+        return not fewest or hits_on(simulated, measured, fit.transform) >= fewest
+
+    fits = [
+        refine(simulated, measured, fit.transform, MEDIUM, least, *bounds)
+        for fit in distinct(filter(shown, fits), _MAX_FITS)
+    ]
+    fits = [*filter(shown, fits)]
+    if not fits:
+        raise ValueError(
+            f"the measured map must show at least {fewest:.0f} of the simulated hits, which no registration does: "
+            "give scales, or simulate more ions"
+        )
     fits = distinct(sorted(fits, key=lambda fit: -fit.rank), _MAX_FITS)
     fits = [fit for fit in fits if fit.rank > fits[0].rank - 2 * _noise(fits[0], MEDIUM)]
     for _ in range(2):  # repeated, with flattening at the new scale
@@ -647,6 +663,17 @@ def _view(value, name):
         # without the extent of the detector the bins cover only the hits
         value = DetectorMap.from_hits(replace(value, extent=None), bins=_BINS if name == "simulated" else 256)
     return View(value)
+
+
+def _fewest_hits(simulated):
+    """Simulated hits that the measured map must show, 0 if they are not counted."""
+    return min(FEWEST, simulated.map.values[simulated.mask].sum() / 4) if simulated.map.is_counts else 0.0
+
+
+def _default_scales(simulated, fewest, ratio):
+    """Scales of the search; at the largest one the measured map shows the fewest hits, at twice their mean density."""
+    shown = simulated.map.values[simulated.mask].sum() / fewest if fewest else np.inf
+    return np.sqrt(0.5) * ratio, min(5, np.sqrt(2 * shown)) * ratio
 
 
 def _range(value, name, **limits):

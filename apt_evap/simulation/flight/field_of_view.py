@@ -13,13 +13,14 @@ import numpy as np
 from apt_evap._common.types import Floats, Integers
 from apt_evap._core.elementary import sine_and_cosine
 from apt_evap.emission.emissions import Emissions
-from apt_evap.emission.surface_frame import along_surface, rolled_positions, shared_positions
+from apt_evap.emission.surface_frame import along_surface, shared_positions
+from apt_evap.simulation.flight.launch_designs import shares_of
 from apt_evap.simulation.flight.response import ResponseSettings
 
 MARGIN = 0.5
 """Margin in units of the largest predicted deviation from the flight at rest from the site. Measured: launches end up
 to 0.39 of it closer to the axis than all predictions (20,300 ions; Ni, Al, W, Ni with 15 % W, a particle of Ni in Al;
-five axes; R = 8 and 16 a; linear and wide responses, energies up to 0.3, 1.5 and 4 eV)."""
+five axes; R = 8 and 16 a; energies up to 0.3, 1.5 and 4 eV)."""
 LEAST_MARGIN = 0.5
 """Further margin for errors that do not depend on the energy, such as those of the scouts themselves [degrees]."""
 
@@ -56,11 +57,8 @@ def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
     -------
     Scouts
     """
-    if settings.is_wide:
-        rolled = shared_positions(emissions, np.eye(3)[None])
-    else:
-        rolled = rolled_positions(emissions)[:, None]
-    places = [emissions.positions[:, None], rolled]
+    corners = shares_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))  # of the places of a roll-up
+    places = [emissions.positions[:, None], shared_positions(emissions, corners[None])]
     fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)
     first = along_surface(emissions.normals, fastest, np.zeros_like(fastest))
     second = along_surface(emissions.normals, np.zeros_like(fastest), fastest)

@@ -1,9 +1,9 @@
-"""The response of an ion: position and time of its hit, as polynomials of its launch velocity along the surface.
+"""The response of an ion: position and time of its hit, as polynomials of its launch.
 
-The detector position of an ion is a smooth function of its two tangential launch velocities. A few flights determine
-one polynomial for launches from the site, and another for launches from the rolled-up position. Together they give the
-hits of any perturbation along the surface, without further flights. Wide responses (`ResponseSettings.wide`) are also
-polynomials of the place between several targets of the roll-up, and of the height of the launch.
+The detector position of an ion is a smooth function of its two tangential launch velocities, of the height of its start
+and, after a roll-up, of the place between the targets. Some flights determine one polynomial for launches from the
+site, and another for launches after a roll-up. Together they give the hits of any perturbation along the surface,
+without further flights.
 
 The fitted quantities are the stereographic direction (see `Detector.directions`), and the time of flight times the
 cosine of the polar angle. They are smoother than the detector position, which diverges for ions that fly parallel to
@@ -13,19 +13,17 @@ the detector.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apt_evap._common.codec import count, from_plain, number, part, settings
+from apt_evap._common.codec import count, number, part, settings
 from apt_evap._common.small_matrices import squared_lengths
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_switch
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, TangentialLaunches
 from apt_evap.emission.energies import HIGHEST_ENERGY
-from apt_evap.emission.surface_frame import along_surface, rolled_positions, shared_positions
+from apt_evap.emission.surface_frame import along_surface, shared_positions
 from apt_evap.simulation.flight.landing import Ends, land
 from apt_evap.simulation.flight.launch_designs import (
     FIRST_VELOCITY,
@@ -35,25 +33,28 @@ from apt_evap.simulation.flight.launch_designs import (
     THIRD,
     VARIABLES,
     Design,
-    WideDesign,
+    height_variable,
+    heights_of,
+    places_of,
+    shares_of,
 )
 from apt_evap.units import FLIGHT_TIME
 from apt_evap.warnings import ResponseWarning, warn
+
+_ROUNDING = 1e-9  # of shares and heights
 
 
 @settings
 class ResponseSettings:
     """Flights and polynomials of the responses.
 
-    Both designs are `Design`, or both `WideDesign`, see `wide`.
-
     Examples
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1))
     >>> settings = ae.ResponseSettings(energy_limit=3.0)
     >>> run = ae.Simulation(tip, seed=1, response_settings=settings).run(50)
-    >>> run.hits(ae.RollUp(2.5))
-    <Hits: 50 ions, 46 detected from 'simulation, RollUp(2.5)'; x, y, time_of_flight, ...>
+    >>> run.hits(ae.RollUp(2.5, sharpness=0.15, height=0.1))
+    <Hits: 50 ions, 46 detected from 'simulation, RollUp(2.5, sharpness=0.15, height=0.1)'; x, y, time_of_flight, ...>
     """
 
     energy_limit: float = number(
@@ -63,25 +64,20 @@ class ResponseSettings:
         at_most=HIGHEST_ENERGY,
         unit="eV",
     )
-    site: Design | WideDesign = part(
-        "Launches from the site. Measured on Ni[111], R = 80 a, 300 ions: median deviation from flights at random "
-        "energies up to 1.5 eV 0.008 mm on a detector at 100 mm.",
+    site: Design = part(
+        "Launches from the site.",
         Design,
-        WideDesign,
-        default=Design(4, ((0.0, 1), (0.55, 7), (1.0, 9))),
+        default=Design((5, 4, 2, 1, 0), ((0.0, 1), (0.5, 5), (0.75, 7), (1.0, 11)), 62),
     )
-    rolled: Design | WideDesign = part(
-        "Launches from the rolled-up position; the same deviation is 0.0016 mm.",
+    rolled: Design = part(
+        "Launches after a roll-up, from any place between the targets.",
         Design,
-        WideDesign,
-        default=Design(3, ((0.0, 1), (0.6, 5), (1.0, 7))),
+        default=Design((3, 2, 1, 0), ((0.0, 1), (0.6, 5), (1.0, 7)), 78, place=True),
     )
     bound: float = number(
         "Residual of a fit on the detector above which an ion is flagged.", default=0.2, above=0, unit="mm"
     )
-    height: float = number(
-        "Largest launch height of wide designs; 0 for others.", default=0.0, at_least=0, at_most=1.0, unit="nm"
-    )
+    height: float = number("Largest height of the launches.", default=0.2, above=0, at_most=1.0, unit="nm")
     shells: int = count(
         "Shells of neighbours that can be targets of a roll-up: 1 for nearest neighbours, 2 also for second ones, "
         "which in bcc are only 15 % more distant.",
@@ -91,59 +87,14 @@ class ResponseSettings:
     )
 
     def _check(self):
-        if isinstance(self.site, WideDesign) != isinstance(self.rolled, WideDesign):
-            raise ValueError(f"site and rolled must both be a Design or both a WideDesign, got {self.site!r:.60}")
-        if self.is_wide and not (self.height > 0 and self.rolled.place > 0 == self.site.place):  # type: ignore[union-attr]
+        if self.site.place or not self.rolled.place:
             raise ValueError(
-                "wide designs need a height > 0 nm, and a place of degree 0 for site and > 0 for rolled, got "
-                f"{self.height:g} nm, {self.site.place} and {self.rolled.place}"  # type: ignore[union-attr]
+                f"site must be a Design without and rolled one with a place, got {self.site.place} and "
+                f"{self.rolled.place}"
             )
-        if not self.is_wide and self.height > 0:
-            raise ValueError(f"height needs wide designs (ResponseSettings.wide), got {self.height:g} nm")
-
-    @classmethod
-    def wide(cls, height: float = 0.2, **others: Any) -> ResponseSettings:
-        """Settings whose responses also cover other targets of the roll-up and other launch heights.
-
-        A run then covers any `sharpness`, `probability` and `height` of the perturbations in post-processing.
-
-        Parameters
-        ----------
-        height : float
-            Largest launch height [nm].
-        **others
-            Further parameters but the designs.
-
-        Returns
-        -------
-        ResponseSettings
-
-        Notes
-        -----
-        Second neighbours are farther apart, so that the polynomials need more terms. For Ni[111], R = 12 a, 100 ions,
-        up to 0.35 eV, the median deviations from flights are then 0.02 to 0.09 mm on a detector at 100 mm; with the
-        terms for nearest neighbours, they would be 0.11 to 0.18 mm.
-        """
-        rolled = WideDesign(4, 2, 2, 4) if others.get("shells") == 2 else WideDesign(3, 2, 2, 3)
-        return cls(site=WideDesign(0, 4, 3, 4), rolled=rolled, height=height, **others)
-
-    @classmethod
-    def of_table(cls, table: dict[str, Any]) -> ResponseSettings:
-        """Settings from a table ``[responses]`` of a file: ``wide = true`` chooses wide designs."""
-        values = dict(table)
-        wide = check_switch(values.pop("wide", False), "wide")
-        if not wide:
-            return from_plain(values, cls, what="responses")
-        from_plain({name: value for name, value in values.items() if name != "height"}, cls, what="responses")
-        return cls.wide(**values)
 
     @property
-    def is_wide(self) -> bool:
-        """Whether the responses serve several targets of the roll-up and launch heights."""
-        return isinstance(self.rolled, WideDesign)
-
-    @property
-    def designs(self) -> tuple[Design | WideDesign, Design | WideDesign]:
+    def designs(self) -> tuple[Design, Design]:
         """Designs of the launches from the site, and after a roll-up."""
         return self.site, self.rolled
 
@@ -152,21 +103,24 @@ class ResponseSettings:
         n = len(launches.rolled)
         variables = np.zeros((n, len(VARIABLES)))
         velocities = self.reduced(np.column_stack([launches.first, launches.second]), masses)
-        variables[:, FIRST_VELOCITY], variables[:, SECOND_VELOCITY] = velocities.T
+        variables[:, [FIRST_VELOCITY, SECOND_VELOCITY]] = velocities
         if launches.shares is not None:
-            variables[:, [SECOND, THIRD]] = launches.shares[:, 1:]
+            places = np.where(np.asarray(launches.rolled)[:, None], places_of(launches.shares), 0.0)
+            rest = 1.0 - places[:, 0] - places[:, 1]
+            wrong = np.flatnonzero(~((places > -_ROUNDING).all(axis=1) & (rest > -_ROUNDING)))
+            if len(wrong):
+                raise ValueError(
+                    "the responses serve shares that do not increase from the strongest neighbour on, got "
+                    f"{launches.shares[wrong[0]].tolist()}: fly this perturbation in the run (`emissions`)"
+                )
+            variables[:, [SECOND, THIRD]] = places
         if launches.heights is not None:
-            variables[:, HEIGHT] = launches.heights / (self.height or 1.0)
-        if not self.is_wide and variables[:, [SECOND, THIRD, HEIGHT]].any():
-            raise ValueError(
-                "the responses of this run serve launches from the site and above the strongest neighbour only, got "
-                "shares of other neighbours or a height: run with response_settings=ResponseSettings.wide()"
-            )
-        if n and variables[:, HEIGHT].max() > 1.0 + 1e-9:
-            raise ValueError(
-                f"the responses of this run serve heights up to {self.height:g} nm, got {launches.heights.max():g} nm: "  # type: ignore[union-attr]
-                "run with ResponseSettings.wide(height=...)"
-            )
+            if n and launches.heights.max() > self.height * (1.0 + _ROUNDING):
+                raise ValueError(
+                    f"the responses of this run serve heights up to {self.height:g} nm, got "
+                    f"{launches.heights.max():g} nm: run with ResponseSettings(height=...)"
+                )
+            variables[:, HEIGHT] = height_variable(launches.heights / self.height)
         return variables
 
     def reduced(self, velocities: Floats, masses: ArrayLike) -> Floats:
@@ -176,7 +130,7 @@ class ResponseSettings:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Responses:
-    """Responses of n ions to their launch velocity.
+    """Responses of n ions to their launch.
 
     Parameters
     ----------
@@ -184,7 +138,7 @@ class Responses:
         Coefficients of three quantities, for launches from the site: the two components of the stereographic direction,
         and the time of flight times the cosine of the polar angle [ns].
     rolled : ndarray of float32, shape (n, 3, coefficients)
-        The same for launches from the rolled-up position.
+        The same for launches after a roll-up.
     residuals : ndarray of float32, shape (n, 2)
         Residuals of the two fits [mm].
     not_flown : ndarray of bool, shape (n,), optional
@@ -218,14 +172,14 @@ class ResponseModel:
         self.settings, self.detector = settings, detector
 
     def launches(self, emissions: Emissions) -> tuple[Floats, Floats]:
-        """Launches of the designs, from the site and then from the rolled-up positions: one group of flights.
+        """Launches of the designs, from the site and then after a roll-up: one group of flights.
 
         These places are 0.3 nm apart, so the launches of an ion soon fly in one narrow tube.
 
         Parameters
         ----------
         emissions : Emissions
-            A batch of n.
+            A batch of n, with its targets.
 
         Returns
         -------
@@ -235,20 +189,15 @@ class ResponseModel:
         settings, n = self.settings, len(emissions)
         fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)[:, None]
         positions, velocities = [], []
-        for rolled, design in zip((False, True), settings.designs, strict=True):
+        for design in settings.designs:
             launches = np.zeros((len(design.launches), len(VARIABLES)))
             launches[:, list(design.columns)] = design.launches
-            if not rolled:
-                starts = np.broadcast_to(emissions.positions[:, None], (n, len(launches), 3))
-            elif settings.is_wide:
-                second, third = launches[:, SECOND], launches[:, THIRD]
-                shares = np.stack([1.0 - second - third, second, third], axis=1)[None]
-                starts = shared_positions(emissions, shares)
+            if design.place:
+                starts = shared_positions(emissions, shares_of(launches[:, [SECOND, THIRD]])[None])
             else:
-                starts = np.broadcast_to(rolled_positions(emissions)[:, None], (n, len(launches), 3))
-            if settings.is_wide:
-                starts = starts + (settings.height * launches[:, HEIGHT])[:, None] * emissions.normals[:, None]
-            positions.append(starts)
+                starts = np.broadcast_to(emissions.positions[:, None], (n, len(launches), 3))
+            heights = settings.height * heights_of(launches[:, HEIGHT])
+            positions.append(starts + heights[:, None] * emissions.normals[:, None])
             velocities.append(
                 along_surface(
                     emissions.normals, fastest * launches[:, FIRST_VELOCITY], fastest * launches[:, SECOND_VELOCITY]
