@@ -151,7 +151,7 @@ def test_the_search_is_the_direct_evidence():
 
 @pytest.mark.slow
 def test_a_measured_map_of_nickel_is_decided():
-    """Six lines meet at (-9.6, -0.4) mm in a {111} pole, ten poles give 25.8 mm/rad: the likelihood alone misses both."""
+    """Six lines meet at (-9.6, -0.4) mm in a {111} pole, ten poles give 25.8 mm/rad."""
     path = Path(__file__).parents[3] / "shared" / "data" / "ni111_map.npz"
     if not path.exists():
         pytest.skip(f"the measured map {path} is missing")
