@@ -1,6 +1,6 @@
 """Make the master patterns that come with the package, from simulations: apt_evap/maps/indexing/patterns/*.npz.
 
-    python tools/master_patterns.py RUNS              # all of them, about 70 minutes of one core
+    python tools/master_patterns.py RUNS              # all of them, about 80 minutes of one core
     python tools/master_patterns.py RUNS --only Ni 20
 
 Runs are kept in the folder RUNS. The extremal law, charges at a constant potential, a law that sees the field of all
@@ -22,6 +22,9 @@ JOBS = {  # element and radius [a]: number of tips, events before the first ion,
     ("W", 20): (6, 2_500, 7_000),
     ("Si", 20): (6, 6_000, 20_000),
     ("Ti", 20): (6, 2_500, 8_000),
+    ("Ni", 40): (2, 15_000, 55_000),
+    ("W", 40): (1, 10_000, 50_000),
+    ("Si", 40): (1, 20_000, 60_000),
     ("Ni", 80): (1, 40_000, 120_000),
     ("W", 80): (1, 30_000, 120_000),
     ("Si", 80): (1, 60_000, 120_000),

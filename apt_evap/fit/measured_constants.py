@@ -281,7 +281,8 @@ def _scale_of(measured, candidate):
     disc = disc_of(measured)
     bins, scale = bins_of(disc), candidate.projection.scale
     densities = candidate.pattern.smoothed(resolution(disc, scale))
-    fitted = refine(bins, disc, densities, candidate.orientation.matrix, scale, candidate.rolled, steps=20)
+    amplitudes = 0.5 * np.array([1 - candidate.rolled, candidate.rolled])
+    fitted = refine(bins, disc, densities, candidate.orientation.matrix, scale, amplitudes, steps=20)
     return fitted.scale, fitted.scale * math.sqrt(fitted.covariance[3, 3] * fitted.dispersion)
 
 

@@ -48,7 +48,7 @@ def test_large_tips_have_narrow_poles():
     pole = np.ones(3) / np.sqrt(3)
     towards -= pole * (pole @ towards)
     towards /= np.linalg.norm(towards)
-    small, large = (
+    small, _, large = (
         pattern.at(np.cos(around)[:, None] * pole + np.sin(around)[:, None] * towards, sigma=0.7)[0]
         for pattern in master_patterns("fcc")
     )

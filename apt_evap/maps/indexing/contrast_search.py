@@ -1,8 +1,9 @@
 """Search of the orientation of a map by its local contrast: by lines and dark poles, as a person sees them.
 
 Map and crystal pass the same filter. The ratio of two means, within 0.035 and 0.12 radii of the field of view, minus
-one and between -1 and 1, has neither the slow changes of a map nor the amplitude of one very bright line. The picture y
-of a map is then modelled as a sum of terms of the crystal in an orientation,
+one and between -1 and 1, has no slow changes. Divided by its local standard deviation it has no areas of strong and of
+weak structure, either: one very bright line does not decide. The picture y of a map is then modelled as a sum of terms
+of the crystal in an orientation,
 
     y = sum_k a_k t_k + noise,
 
@@ -20,7 +21,9 @@ the variance of y that is explained. The second part is why terms that are diffe
 more, are not better by themselves.
 """
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -28,7 +31,7 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.directions import poles, zones
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, nearest
+from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, nearest, sampled
 from apt_evap.maps.indexing.orientation_search import (
     AZIMUTHS,
     RINGS,
@@ -51,38 +54,56 @@ PATTERN, LINES, POLES = 0.6, 1.0, 0.8
 """Standard deviations of the priors of the amplitudes, for terms and picture of a variance of 1."""
 AXIS_STEP, SCALE_STEP = 2.5, 0.07
 """Steps of the search: of the axes [degrees], and of the logarithm of the scale."""
+_FLOOR = 0.5  # of the median of the local standard deviation: smaller ones are set to this
+_FLAT = 1e-6  # contrast of an image that has none
 _FAMILIES = 5  # of poles
 _LINE_WIDTH = np.radians(2.0)  # standard deviation: wider than most lines, for the steps of the search
 _POLE_RADIUS = 200.0  # lattice constants: the facet of planes d apart is sqrt(2 d / R) wide
+_STRETCH = 0.05  # standard deviation of the prior of the radial stretch at the rim, as in `refine`
+_STEPS, _FINE = 8, 0.02  # steps of a refinement at most; change of the evidence that ends it
+_DIFFERENCE = 4e-3  # [rad] of the numerical derivatives
 _FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms are filtered again
 
 
-def local_contrast(values: Floats, mask: np.ndarray, narrow: Floats, wide: Floats) -> Floats:
-    """Ratio of the means of an image in two Gaussians, minus one, between -1 and 1.
+def local_contrast(
+    values: np.ndarray, mask: np.ndarray, narrow: Floats, wide: Floats, used: np.ndarray | None = None
+) -> np.ndarray:
+    """Contrast of an image in units of its local standard deviation.
 
     Parameters
     ----------
     values : ndarray
-        The image, at least 0.
+        The image, at least 0, or several, shape (..., ny, nx).
     mask : ndarray
-        Which pixels count.
+        Which pixels count, shape (ny, nx).
     narrow, wide : array_like
         Standard deviations along both axes [pixels].
+    used : ndarray, optional
+        Pixels of the median, by default `mask`.
 
     Returns
     -------
     ndarray
+        The ratio of its means in both Gaussians, minus one, between -1 and 1, divided by the square root of its mean
+        square in the wide one, which is at least half its median.
     """
-    inside = mask.astype(float)
-    fine, slow = (
-        scipy.ndimage.gaussian_filter(np.where(mask, values, 0.0), sigma, mode="constant", truncate=3.0)
-        / np.maximum(scipy.ndimage.gaussian_filter(inside, sigma, mode="constant", truncate=3.0), 1e-6)
-        for sigma in (narrow, wide)
-    )
-    return np.clip(fine / np.maximum(slow, 1e-6 * max(float(slow.max()), 1e-30)) - 1, -1, 1)
+    fine, slow = (_mean(values, mask, sigma) for sigma in (narrow, wide))
+    least = 1e-6 * np.maximum(slow.max(axis=(-2, -1), keepdims=True), 1e-30)
+    contrast = np.clip(fine / np.maximum(slow, least) - 1, -1, 1)
+    deviation = np.sqrt(np.maximum(_mean(contrast**2, mask, wide), 0))
+    floor = _FLOOR * np.median(deviation[..., mask if used is None else used], axis=-1)[..., None, None]
+    return contrast / np.maximum(deviation, np.maximum(floor, _FLAT))
 
 
-def _places():
+def _mean(values, mask, sigma):
+    """Mean of the pixels that count in a Gaussian of these standard deviations."""
+    along = (*np.zeros(values.ndim - 2), *np.broadcast_to(sigma, 2))
+    sums = scipy.ndimage.gaussian_filter(np.where(mask, values, 0.0), along, mode="constant", truncate=3.0)
+    area = scipy.ndimage.gaussian_filter(mask.astype(float), sigma, mode="constant", truncate=3.0)
+    return sums / np.maximum(area, 1e-6)
+
+
+def places_of() -> tuple[Floats, Floats]:
     """Points of a polar picture in radii of the disc, (n, 2), and their areas, (n,)."""
     radii, azimuths = polar_grid(RINGS, AZIMUTHS)
     r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
@@ -91,7 +112,7 @@ def _places():
 
 def picture_of(disc: Disc) -> Floats:
     """Local contrast of a map at the points of a polar picture, with a mean of 0 and a variance of 1, shape (n,)."""
-    places, areas = _places()
+    places, areas = places_of()
     sizes = np.array(disc.map.bin_size[::-1])
     image = local_contrast(disc.map.values, disc.map.mask, NARROW * disc.radius / sizes, WIDE * disc.radius / sizes)
     x, y = disc.map.centres
@@ -117,26 +138,30 @@ class Terms:
         x, y = np.meshgrid(line, line)
         stretch = np.sqrt(np.maximum(1 - (x * x + y * y) / 4, 0))
         directions = np.stack([x * stretch, y * stretch, 1 - (x * x + y * y) / 2], axis=-1)
-        self._inside = x * x + y * y <= 2
-        self._images = [density for pattern in patterns for density in pattern.densities]
+        self._inside = self._used = x * x + y * y <= 2
+        images = [density for pattern in patterns for density in pattern.densities]
         axes = zones(material)
         families = [axes.directions[axes.families == family] for family in range(axes.families.max() + 1)]
         for members in families:
             angles = np.arcsin(np.minimum(np.abs(directions @ members.T).min(axis=-1), 1))
-            self._images.append(1 + np.exp(-0.5 * (angles / _LINE_WIDTH) ** 2))
+            images.append(1 + np.exp(-0.5 * (angles / _LINE_WIDTH) ** 2))
         crystal = poles(material, _FAMILIES)
         spacings = crystal.spacings.round(9)
         for spacing in sorted(set(spacings), reverse=True):
             angles = np.arccos(np.minimum(np.abs(directions @ crystal.normals[spacings == spacing].T).max(axis=-1), 1))
             width = 0.5 * np.sqrt(2 * spacing / (_POLE_RADIUS * material.a))
-            self._images.append(1 - np.exp(-0.5 * (angles / width) ** 2))
+            images.append(1 - np.exp(-0.5 * (angles / width) ** 2))
+        self._images = np.stack(images)
         counts = 2 * len(patterns), len(families), len(set(spacings))
         self.priors = np.repeat([PATTERN, LINES, POLES], counts)
         """Standard deviations of the amplitudes, shape (k,)."""
         self.signed = np.repeat([False, True, False], counts)
         """Which amplitudes may be negative, shape (k,)."""
-        self._cubic = material.structure != "hcp"
-        self._filtered: dict[int, Floats] = {}
+        self.structure = material.structure
+        """Crystal structure."""
+        if self.structure != "hcp":  # those of one triangle, see `equal`
+            self._used = (directions[..., 0] >= 0) & (np.diff(directions, axis=-1) >= 0).all(axis=-1)
+        self._filtered: dict[int, np.ndarray] = {}
 
     def at(self, directions: Floats, half_angle: float) -> Floats:
         """Filtered terms at unit vectors of the crystal.
@@ -153,14 +178,27 @@ class Terms:
         ndarray
             Shape (k, m).
         """
+        return nearest(self.images(half_angle), self.equal(directions))
+
+    def equal(self, directions: Floats) -> Floats:
+        """Equal directions; of cubic crystals those next to [001], where the pixels are least distorted."""
+        return np.sort(np.abs(directions), axis=1) if self.structure != "hcp" else directions
+
+    def images(self, half_angle: float) -> np.ndarray:
+        """Filtered terms on the hemisphere for a field of view of this half angle [rad], shape (k, n, n)."""
         step = round(float(np.log(half_angle)) / _FILTER_STEP)
         if step not in self._filtered:
             sizes = np.array([NARROW, WIDE]) * np.exp(step * _FILTER_STEP) / PIXEL
-            images = [local_contrast(image, self._inside, *sizes) for image in self._images]
-            self._filtered[step] = np.stack(images).astype(np.float32)
-        if self._cubic:  # the equal direction next to [001], where the pixels are least distorted
-            directions = np.sort(np.abs(directions), axis=1)
-        return nearest(self._filtered[step], directions)
+            margin = int(np.ceil(6 * sizes[1])) + 2  # two Gaussians of three standard deviations
+            near = tuple(
+                slice(max(0, np.flatnonzero(lines)[0] - margin), np.flatnonzero(lines)[-1] + margin + 1)
+                for lines in (self._used.any(axis=1), self._used.any(axis=0))
+            )
+            part = self._images[:, *near], self._inside[near], sizes[0], sizes[1], self._used[near]
+            filtered = np.zeros(self._images.shape, np.float32)
+            filtered[:, *near] = local_contrast(*part)
+            self._filtered[step] = filtered
+        return self._filtered[step]
 
 
 def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> Floats:
@@ -186,24 +224,39 @@ def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) ->
     ridge = gram + np.diag(1 / (PIECES * priors**2))
     amplitudes = np.linalg.solve(ridge, cross)
     amplitudes = np.where(signed[:, None], amplitudes, np.maximum(amplitudes, 0))
+    return _evidence(ridge, cross, priors, amplitudes)
+
+
+def exact_evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> tuple[float, Floats]:
+    """Evidence E of one picture with the best amplitudes, and these, shape (k,); parameters as of `evidence`."""
+    ridge = gram + np.diag(1 / (PIECES * priors**2))
+    root = np.linalg.cholesky(ridge).T
+    # an amplitude of either sign is the difference of two that are not negative
+    parts = scipy.optimize.nnls(np.hstack([root, -root[:, signed]]), np.linalg.solve(root.T, cross))[0]
+    amplitudes = parts[: len(priors)]
+    amplitudes[signed] -= parts[len(priors) :]
+    return float(_evidence(ridge, cross[:, None], priors, amplitudes[:, None])[0]), amplitudes
+
+
+def _evidence(ridge, cross, priors, amplitudes):
     explained = (amplitudes * (2 * cross - ridge @ amplitudes)).sum(axis=-2)
-    volume = np.linalg.slogdet(np.eye(len(priors)) + PIECES * priors[:, None] * gram * priors)[1]
+    volume = np.linalg.slogdet(PIECES * priors[:, None] * ridge * priors)[1]  # of 1 + N S G S
     return -PIECES * np.log1p(-np.clip(explained, 0, 0.999)) - volume[..., None]
 
 
 def search_contrast(
-    disc: Disc, material: Material, patterns: Sequence[MasterPattern], scales: tuple[float, float], n_max: int
+    picture: Floats, radius: float, terms: Terms, scales: tuple[float, float], n_max: int
 ) -> list[Start]:
     """Compare the local contrast of a map with all orientations and scales of a crystal.
 
     Parameters
     ----------
-    disc : Disc
-        The map.
-    material : Material
-        The crystal.
-    patterns : sequence of MasterPattern
-        Its patterns.
+    picture : ndarray
+        That of the map, of `picture_of`.
+    radius : float
+        Radius of the field of view [mm].
+    terms : Terms
+        Those of the crystal.
     scales : tuple of float
         Smallest and largest scale [mm/rad].
     n_max : int
@@ -212,43 +265,120 @@ def search_contrast(
     Returns
     -------
     list of Start
-        The orientations of the largest evidence, each more than two steps from a better one, the best first; for every
-        pattern one start, with half of each density.
+        The orientations of the largest evidence, each more than two steps from a better one, the best first.
     """
-    places, areas = _places()
-    terms = Terms(material, patterns)
-    spectrum = np.fft.rfft((picture_of(disc) * areas).reshape(RINGS, AZIMUTHS), axis=1)
-    group = point_group(material.structure)
+    places, areas = places_of()
+    areas = areas.astype(np.float32)  # half the time
+    spectrum = scipy.fft.rfft((picture.astype(np.float32) * areas).reshape(RINGS, AZIMUTHS), axis=1)
+    group = point_group(terms.structure)
     proper = group[np.linalg.det(group) > 0]
-    turns = np.stack([about_axis(axis) for axis in axes_of(material.structure, AXIS_STEP)])
+    turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, AXIS_STEP)])
     azimuths = polar_grid(RINGS, AZIMUTHS)[1]
     steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
     scored = []
     for scale in np.geomspace(*scales, steps + 1):
-        local = directions_of(places, disc.radius, scale, 0.0)
-        pictures = terms.at((local @ turns).reshape(-1, 3), disc.radius / scale)
-        pictures = pictures.reshape(len(terms.priors), len(turns), -1).swapaxes(0, 1).astype(float)
+        local = directions_of(places, radius, scale, 0.0)
+        pictures = terms.at((local @ turns).reshape(-1, 3), radius / scale)
+        pictures = pictures.reshape(len(terms.priors), len(turns), -1).swapaxes(0, 1)
         pictures -= (pictures @ areas)[..., None]
         pictures /= np.maximum(np.sqrt(pictures**2 @ areas), 1e-3)[..., None]
         gram = (pictures * areas) @ pictures.swapaxes(1, 2)
-        spectra = np.fft.rfft(pictures.reshape(*pictures.shape[:2], RINGS, AZIMUTHS), axis=3)
+        spectra = scipy.fft.rfft(pictures.reshape(*pictures.shape[:2], RINGS, AZIMUTHS), axis=3)
         for mirror in (False, True):
             products = ((spectra if mirror else spectra.conj()) * spectrum).sum(axis=2)
-            values = evidence(gram, np.fft.irfft(products, AZIMUTHS, axis=2), terms.priors, terms.signed)
+            values = evidence(gram, scipy.fft.irfft(products, AZIMUTHS, axis=2), terms.priors, terms.signed)
             best = values.argmax(axis=1)
             for turn, column, value in zip(turns, best, values.max(axis=1), strict=True):
                 scored.append((value, scale, turn, mirror, azimuths[column]))
     scored.sort(key=lambda entry: -entry[0])
-    chosen: list[tuple[Floats, float]] = []
     starts: list[Start] = []
     for value, scale, turn, mirror, angle in scored:
         matrix = oriented(turn, mirror, angle)
         if not any(
-            misorientation(matrix, other, proper) < 2 * AXIS_STEP and abs(np.log(scale / size)) < 2.5 * SCALE_STEP
-            for other, size in chosen
+            misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
+            and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
+            for other in starts
         ):
-            chosen.append((matrix, scale))
-            starts += [Start(matrix, float(scale), float(value), 0.5, number) for number in range(len(patterns))]
-            if len(chosen) == n_max:
+            starts.append(Start(matrix, float(scale), float(value)))
+            if len(starts) == n_max:
                 break
     return starts
+
+
+class Explained(NamedTuple):
+    """An orientation at a maximum of the evidence."""
+
+    matrix: np.ndarray
+    """Rotation from crystal to specimen, shape (3, 3)."""
+    scale: float
+    """[mm/rad], from the centre to the rim of the disc."""
+    stretch: float
+    """Radial stretch, as in `refine`."""
+    evidence: float
+    """E of the module, with a prior of the stretch."""
+
+
+def refine_contrast(
+    picture: Floats, radius: float, terms: Terms, start: Start, bounds: tuple[float, float]
+) -> Explained:
+    """Maximise the evidence near a start by Gauss-Newton steps; the amplitudes follow.
+
+    Parameters
+    ----------
+    picture : ndarray
+        That of the map, of `picture_of`.
+    radius : float
+        Radius of the field of view [mm].
+    terms : Terms
+        Those of the crystal.
+    start : Start
+        Orientation and scale.
+    bounds : tuple of float
+        Bounds of the scale [mm/rad].
+
+    Returns
+    -------
+    Explained
+    """
+    places, areas = places_of()
+    limits = np.log(bounds)
+
+    def sample(images, geometry):
+        turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
+        directions = directions_of(places, radius, math.exp(geometry[3]), geometry[4]) @ turn
+        pictures = sampled(images, terms.equal(directions))
+        return pictures - (pictures @ areas)[:, None]
+
+    def judged(geometry):
+        images = terms.images(radius / math.exp(geometry[3]))
+        pictures = sample(images, geometry)
+        norms = np.maximum(np.sqrt(pictures**2 @ areas), 1e-3)
+        pictures /= norms[:, None]
+        gram, cross = (pictures * areas) @ pictures.T, (pictures * areas) @ picture
+        value, amplitudes = exact_evidence(gram, cross, terms.priors, terms.signed)
+        return value - (geometry[4] / _STRETCH) ** 2, amplitudes / norms, amplitudes @ pictures
+
+    geometry = np.array([0.0, 0.0, 0.0, np.clip(math.log(start.scale), *limits), 0.0])
+    value, amplitudes, model = judged(geometry)
+    for _ in range(_STEPS):
+        image = np.tensordot(amplitudes, terms.images(radius / math.exp(geometry[3])), 1)[None]
+        here = sample(image, geometry)[0]
+        slopes = np.stack([(sample(image, geometry + s)[0] - here) / _DIFFERENCE for s in _DIFFERENCE * np.eye(5)])
+        left = picture - model
+        prior = np.array([0, 0, 0, 0, max(areas @ left**2, 1e-3) / (PIECES * _STRETCH**2)])
+        normal = (slopes * areas) @ slopes.T
+        right = (slopes * areas) @ left - prior * geometry
+        step = np.linalg.solve(normal + np.diag(prior + 1e-2 * np.diag(normal) + 1e-9), right)
+        step = np.clip(step, -0.05, 0.05)
+        for _ in range(3):
+            moved = geometry + step
+            moved[3:] = np.clip(moved[3], *limits), np.clip(moved[4], -0.2, 0.2)
+            new = judged(moved)
+            if new[0] > value:
+                break
+            step = step / 3
+        if new[0] <= value + _FINE:
+            break
+        geometry, (value, amplitudes, model) = moved, new
+    turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
+    return Explained(turn, math.exp(geometry[3]), float(geometry[4]), value)

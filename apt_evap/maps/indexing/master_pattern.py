@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -181,6 +182,29 @@ def nearest(densities: Floats, directions: Floats) -> Floats:
     """Densities on the disc, shape (k, n, n), at the pixels next to unit vectors of shape (m, 3), (k, m)."""
     row, column = np.rint(pixels_of(directions)).astype(np.intp)
     return densities[:, row, column]
+
+
+def mixture(patterns: Sequence[MasterPattern], amplitudes: Floats) -> MasterPattern:
+    """Mean of patterns of several radii.
+
+    Parameters
+    ----------
+    patterns : sequence of MasterPattern
+        Patterns of one structure.
+    amplitudes : ndarray
+        Of the two densities of each pattern, shape (2 n,).
+
+    Returns
+    -------
+    MasterPattern
+        With the mean of the logarithms of their radii.
+    """
+    parts = np.asarray(amplitudes, float).reshape(-1, 2) + 1e-9  # equal ones, if there is none
+    weights = parts / parts.sum(axis=0)
+    densities = np.einsum("ks,ksij->sij", weights, np.stack([pattern.densities for pattern in patterns]))
+    radii = np.log([pattern.apex_radius for pattern in patterns])
+    radius = math.exp(parts.sum(axis=1) @ radii / parts.sum())
+    return MasterPattern(patterns[0].structure, radius, densities, sum(pattern.ions for pattern in patterns))
 
 
 @cache

@@ -59,11 +59,7 @@ class Start(NamedTuple):
     scale: float
     """[mm/rad]."""
     score: float
-    """Correlation of the flattened pictures, 0 to 1."""
-    rolled: float
-    """Amplitude of the pattern of ions that roll up, as a fraction of the sum of both."""
-    pattern: int
-    """Number of the master pattern."""
+    """Of the search: a correlation of the flattened pictures, or an evidence."""
 
 
 def disc_of(map: DetectorMap) -> Disc:
@@ -205,7 +201,7 @@ def search(
                     cost[int(mirror)] = MARK_COST * rotations_misfit(
                         marks, marked, oriented(turn, mirror, 0.0), azimuths
                     )
-            for number, smoothed in enumerate(smooth):
+            for smoothed in smooth:
                 densities = np.minimum(nearest(smoothed, local @ turn), _BRIGHTEST) * root
                 densities -= (densities @ slow) @ slow.T
                 gram = densities @ densities.T
@@ -213,20 +209,20 @@ def search(
                 for mirror in (False, True):
                     both = spectra if mirror else spectra.conj()
                     cross = np.fft.irfft((both * spectrum).sum(axis=1), AZIMUTHS, axis=1)
-                    score, rolled = _amplitudes(cross, gram)
+                    score = _explained(cross, gram)
                     score = score / norm - cost[int(mirror)]
                     best = int(np.argmax(score))
-                    scored.append((score[best], rolled[best], number, scale, turn, mirror, azimuths[best]))
+                    scored.append((score[best], scale, turn, mirror, azimuths[best]))
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []
-    for score, rolled, number, scale, turn, mirror, angle in scored:
+    for score, scale, turn, mirror, angle in scored:
         matrix = oriented(turn, mirror, angle)
         if not any(
             misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
             and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
             for other in starts
         ):
-            starts.append(Start(matrix, float(scale), float(score), float(rolled), number))
+            starts.append(Start(matrix, float(scale), float(score)))
             if len(starts) == n_max:
                 break
     return starts
@@ -240,16 +236,12 @@ def oriented(turn: Floats, mirror: bool, angle: float) -> Floats:
     return about @ (np.diag([1.0, -1.0, 1.0]) @ -turn if mirror else turn)
 
 
-def _amplitudes(cross, gram):
-    """Largest projections onto combinations of two patterns that are not negative, (m,), and shares of the second."""
+def _explained(cross, gram):
+    """Largest projections onto combinations of two patterns that are not negative, (m,)."""
     single = cross / np.sqrt(np.maximum(np.diag(gram), 1e-30))[:, None]
     amplitudes = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(2), cross)
     both = np.sqrt(np.maximum((amplitudes * cross).sum(axis=0), 0))
-    positive = (amplitudes >= 0).all(axis=0)
-    score = np.where(positive, both, single.max(axis=0))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rolled = np.where(positive, amplitudes[1] / amplitudes.sum(axis=0), single[1] > single[0])
-    return score, np.nan_to_num(rolled)
+    return np.where((amplitudes >= 0).all(axis=0), both, single.max(axis=0))
 
 
 def misorientation(first: Floats, second: Floats, rotations: Floats) -> float:

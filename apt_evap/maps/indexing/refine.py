@@ -1,9 +1,10 @@
 """Refinement of an orientation by the likelihood of the counts of a map.
 
-The expected counts of a bin in the direction v are ``mu = s(x, y) (1 + a_0 (D_0(v) - 1) + a_1 (D_1(v) - 1))`` with the
-densities D of the master pattern of ions that do not roll up and of ions that do. s is the exponential of a polynomial
-of degree four: the efficiency of the detector, the decrease of the density towards the rim, and everything else that is
-slow. The amplitudes a are at least 0, their sum is at most 1.
+The expected counts of a bin in the direction v are ``mu = s(x, y) (1 + sum_k a_k (D_k(v) - 1))`` with the densities D_k
+of the master patterns of all radii, of ions that do not roll up and of ions that do. A mixture has poles of any size,
+so their size alone does not set the scale. s is the exponential of a polynomial of degree four: the efficiency of the
+detector, the decrease of the density towards the rim, and everything else that is slow. The amplitudes a_k are at least
+0, their sum is at most 1.
 """
 
 import math
@@ -81,7 +82,7 @@ class Refined:
     stretch: float
     """Radial stretch: angles are (r / scale) (1 + stretch (r^2 / radius^2 - 1))."""
     amplitudes: np.ndarray
-    """Of the two patterns, shape (2,)."""
+    """Of the densities, shape (k,)."""
     gain: float
     """Decrease of the deviance by the pattern."""
     explained: float
@@ -183,11 +184,11 @@ class _State(NamedTuple):
     fit: Floats
     """Coefficients of the slow polynomials, shape (k,)."""
     amplitudes: Floats
-    """Of the two patterns, shape (2,)."""
+    """Of the densities, shape (k,)."""
     geometry: Floats
     """Rotation vector from the start [rad], logarithm of the scale at the rim [mm/rad], radial stretch; shape (5,)."""
     contrasts: Floats
-    """Densities of the two patterns in each bin, minus 1, shape (2, n)."""
+    """Densities in each bin, minus 1, shape (k, n)."""
 
 
 class _Likelihood:
@@ -229,7 +230,7 @@ class _Likelihood:
         return directions_of(places, self._disc.radius, scale, geometry[4]) @ self.rotation(geometry)
 
     def contrasts(self, geometry: Floats) -> Floats:
-        """Densities of the two patterns in each bin, minus 1, shape (2, n)."""
+        """Densities in each bin, minus 1, shape (k, n)."""
         return sampled(self._densities, self._crystal_directions(self._bins.places, geometry)) - 1.0
 
     def limits(self, stretch: float) -> Floats:
@@ -264,7 +265,8 @@ class _Likelihood:
         mu, factor = self.expected(state)
         columns = [self._bins.slow * mu[:, None], (state.contrasts * (mu / factor)).T]
         if moving:
-            columns += [self._slope(state, k, mu, factor)[:, None] for k in range(5)]
+            image = np.tensordot(state.amplitudes, self._densities, 1)[None]
+            columns += [self._slope(state, image, k, mu, factor)[:, None] for k in range(5)]
         columns = np.hstack(columns)
         weights = 1 / mu
         normal = columns.T @ (columns * weights[:, None])
@@ -278,32 +280,35 @@ class _Likelihood:
             right[-5:] -= slopes.T @ start
         return normal, right
 
-    def _slope(self, state, k, mu, factor):
+    def _slope(self, state, image, k, mu, factor):
         """Numerical derivative of the expected counts by a number of the geometry, shape (n,)."""
         shifted = state.geometry.copy()
         shifted[k] += _DIFFERENCE
-        return (state.amplitudes @ (self.contrasts(shifted) - state.contrasts)) / _DIFFERENCE * mu / factor
+        moved = sampled(image, self._crystal_directions(self._bins.places, shifted))[0] - state.amplitudes.sum()
+        return (moved - state.amplitudes @ state.contrasts) / _DIFFERENCE * mu / factor
 
-    def fixed_at_bounds(self, state: _State, normal: Floats, right: Floats) -> tuple[Floats, Floats]:
-        """The same equations, without a change of a scale that would leave its bounds."""
-        low, high = self.limits(state.geometry[4])
-        scale = state.geometry[3]
-        if not ((scale <= low and right[-2] < 0) or (scale >= high and right[-2] > 0)):
-            return normal, right
-        fixed, right = normal.copy(), right.copy()
-        fixed[-2, :], fixed[:, -2], right[-2] = 0.0, 0.0, 0.0
-        fixed[-2, -2] = normal[-2, -2]
-        return fixed, right
+    def fixed_at_bounds(self, state: _State, normal: Floats, right: Floats, moving: bool) -> tuple[Floats, Floats]:
+        """The same equations, without changes of amplitudes and of a scale that would leave their bounds."""
+        fixed = np.zeros(len(right), bool)
+        parts = slice(self.n_slow, self.n_slow + len(state.amplitudes))
+        fixed[parts] = (state.amplitudes <= 0) & (right[parts] < 0)
+        if moving:
+            low, high = self.limits(state.geometry[4])
+            scale = state.geometry[3]
+            fixed[-2] = (scale <= low and right[-2] < 0) or (scale >= high and right[-2] > 0)
+        kept = np.where(fixed[:, None] | fixed, np.diag(np.diag(normal)), normal)
+        return kept, np.where(fixed, 0.0, right)
 
     def moved(self, state: _State, change: np.ndarray, moving: bool) -> _State:
         """State after a change of all parameters, limited to what a step may be."""
         n_slow = self.n_slow
         fit = state.fit + np.clip(change[:n_slow], -1, 1)
-        amplitudes = np.maximum(state.amplitudes + np.clip(change[n_slow : n_slow + 2], -0.3, 0.3), 0)
+        n_moved = n_slow + len(state.amplitudes)
+        amplitudes = np.maximum(state.amplitudes + np.clip(change[n_slow:n_moved], -0.3, 0.3), 0)
         amplitudes /= max(1.0, amplitudes.sum())
         if not moving:
             return _State(fit, amplitudes, state.geometry, state.contrasts)
-        geometry = state.geometry + np.clip(change[n_slow + 2 :], -0.05, 0.05)
+        geometry = state.geometry + np.clip(change[n_moved:], -0.05, 0.05)
         geometry[3] = np.clip(geometry[3], *self.limits(geometry[4]))
         return _State(fit, amplitudes, geometry, self.contrasts(geometry))
 
@@ -314,7 +319,7 @@ def refine(
     densities: Floats,
     matrix: Floats,
     scale: float,
-    rolled: float,
+    amplitudes: Floats | None = None,
     marks: Sequence[Mark] = (),
     steps: int = _STEPS,
     bounds: tuple[float, float] | None = None,
@@ -328,9 +333,11 @@ def refine(
     disc : Disc
         Its disc.
     densities : ndarray
-        Densities of the master pattern, smoothed for the size of the bins.
-    matrix, scale, rolled
-        Start: rotation from crystal to specimen, scale [mm/rad], share of the second pattern.
+        Densities of the master patterns, smoothed for the size of the bins, shape (k, m, m).
+    matrix, scale
+        Start: rotation from crystal to specimen, scale [mm/rad].
+    amplitudes : ndarray, optional
+        Start of the amplitudes, shape (k,); by default equal ones.
     marks : sequence of Mark
         Marks of a user.
     steps : int
@@ -346,12 +353,14 @@ def refine(
     if bounds is not None:
         geometry[3] = np.clip(geometry[3], *np.log(bounds))
     likelihood = _Likelihood(bins, disc, densities, matrix, marks, bounds, geometry)
-    state = _State(bins.fit, 0.5 * np.array([1 - rolled, rolled]), geometry, likelihood.contrasts(geometry))
+    if amplitudes is None:
+        amplitudes = np.full(len(densities), 0.5 / len(densities))
+    state = _State(bins.fit, amplitudes, geometry, likelihood.contrasts(geometry))
     damping, value = 1e-3, likelihood.value(state)
     for step in range(steps):
         moving = step >= _FIRST_MOVE
         normal, right = likelihood.normal_equations(state, moving)
-        solved, right = likelihood.fixed_at_bounds(state, normal, right) if moving else (normal, right)
+        solved, right = likelihood.fixed_at_bounds(state, normal, right, moving)
         # Levenberg's damping, larger until the likelihood improves
         better = None
         for _ in range(_ATTEMPTS):
@@ -376,11 +385,14 @@ def _refined(bins, likelihood, state, normal, marks):
     """Result for the parameters at the end; `normal` is the normal matrix there, None if the geometry did not move."""
     mu, _ = likelihood.expected(state)
     n_slow = likelihood.n_slow
-    freedom = max(1, len(mu) - n_slow - 7)
+    used = np.count_nonzero(state.amplitudes)
+    freedom = max(1, len(mu) - n_slow - used - 5)
     dispersion = max(pearson(bins.counts, mu) / freedom, 1.0)
     covariance = np.full((4, 4), np.nan)
     if normal is not None:
-        covariance = np.linalg.pinv(normal)[n_slow + 2 : n_slow + 6, n_slow + 2 : n_slow + 6]
+        free = np.concatenate([np.ones(n_slow, bool), state.amplitudes > 0, np.ones(5, bool)])
+        part = slice(n_slow + used, n_slow + used + 4)
+        covariance = np.linalg.pinv(normal[np.ix_(free, free)])[part, part]
     directions = likelihood.mark_directions(state.geometry)
     return Refined(
         likelihood.rotation(state.geometry),

@@ -1,0 +1,141 @@
+"""Orientations of a map by two witnesses: the likelihood of its counts, and the evidence of its local contrast.
+
+The likelihood (`refine`) sees amplitudes and every count, but slow changes, a dark rim or one very bright line that the
+patterns do not have can mislead it. The evidence (`contrast_search`) sees edges of either sign and no amplitudes of
+large areas, but one filter does not see poles of all sizes. Both are twice the logarithm of a likelihood, so the weight
+of a result is their sum. The logarithm of the likelihood is divided by the dispersion about the best model: a model
+that leaves structure unexplained decides less.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing.contrast_search import Terms, picture_of, places_of, refine_contrast
+from apt_evap.maps.indexing.marked_poles import Mark
+from apt_evap.maps.indexing.orientation_search import Disc, Start
+from apt_evap.maps.indexing.refine import Bins, Refined, bins_of, directions_of, refine
+
+_SAME = 2.0  # degrees: starts that are nearer are refined once
+_QUICK, _STEPS = 7, 20  # of the refinements of all starts, and of the best ones
+_EVERY = 7  # of the points of a polar picture: for angles
+
+
+class View(NamedTuple):
+    """What both witnesses see of a map."""
+
+    disc: Disc
+    """Its field of view."""
+    bins: Bins
+    """Its counts."""
+    picture: Floats
+    """Its local contrast."""
+
+
+class Weighed(NamedTuple):
+    """A result of the search."""
+
+    fit: Refined
+    """That of the likelihood."""
+    evidence: float
+    """That of the local contrast."""
+
+    def weight(self, dispersion: float) -> float:
+        """Twice the logarithm of both likelihoods, for a dispersion of the counts about their best model."""
+        return self.fit.gain / dispersion - self.fit.misfit + self.evidence
+
+
+def view_of(disc: Disc) -> View:
+    """What both witnesses see of a map."""
+    return View(disc, bins_of(disc), picture_of(disc))
+
+
+def angle_between(first, second, group: Floats, radius: float) -> float:
+    """Angle between the crystal directions that two results give to the places of a disc, its RMS [degrees].
+
+    Parameters
+    ----------
+    first, second : Refined or Explained
+        The results.
+    group : ndarray
+        Point group of the crystal, shape (n, 3, 3).
+    radius : float
+        Of the disc [mm].
+
+    Returns
+    -------
+    float
+        The smallest of all equal orientations.
+    """
+    places, areas = (values[::_EVERY] for values in places_of())
+    one, two = (directions_of(places, radius, fit.scale, fit.stretch) @ fit.matrix for fit in (first, second))
+    cosines = np.einsum("gij,nj,ni->gn", group, two, one)
+    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    return float(np.sqrt((angles**2 @ areas).min() / areas.sum()))
+
+
+def weighed(
+    view: View,
+    terms: Terms,
+    densities: Floats,
+    starts: Sequence[Start],
+    n: int,
+    bounds: tuple[float, float],
+    marks: Sequence[Mark] = (),
+) -> list[Weighed]:
+    """Refine orientations by both witnesses.
+
+    Parameters
+    ----------
+    view : View
+        The map.
+    terms : Terms
+        Those of the local contrast of the crystal.
+    densities : ndarray
+        Densities of its patterns, smoothed for the bins, shape (k, m, m).
+    starts : sequence of Start
+        Orientations.
+    n : int
+        Number of the best ones of each witness that are refined to the end.
+    bounds : tuple of float
+        Smallest and largest scale [mm/rad].
+    marks : sequence of Mark
+        Marks of a user.
+
+    Returns
+    -------
+    list of Weighed
+        Not sorted.
+    """
+    disc, bins, picture = view
+    group = point_group(terms.structure)
+
+    def by_likelihood(start, steps):
+        return refine(bins, disc, densities, start.matrix, start.scale, None, marks, steps, bounds)
+
+    def by_contrast(start):
+        return refine_contrast(picture, disc.radius, terms, start, bounds)
+
+    likely = [by_likelihood(start, _QUICK) for start in starts]
+    seen = [by_contrast(start) for start in starts]
+    dispersion = dispersion_of(likely)
+    likely.sort(key=lambda fit: fit.misfit - fit.gain / dispersion)
+    seen.sort(key=lambda fit: -fit.evidence)
+    different: list = []
+    for start in likely[:n] + seen[:n]:
+        if all(angle_between(start, other, group, disc.radius) > _SAME for other in different):
+            different.append(start)
+    results = []
+    for start in different:
+        fit = by_likelihood(start, _STEPS)
+        # each from where the other one is best
+        results.append(Weighed(fit, max(by_contrast(start).evidence, by_contrast(fit).evidence)))
+    return results
+
+
+def dispersion_of(fits: Sequence[Refined]) -> float:
+    """Dispersion about the model that explains most."""
+    return max(fits, key=lambda fit: fit.gain).dispersion
