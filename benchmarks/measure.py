@@ -337,6 +337,50 @@ def fly(flier, journal, events, launches, positions, velocities):
     return end, outcome
 
 
+def flight_errors(radii=(40, 80), shank=1.0, ions=300):
+    """Places of flights alone against those with sums over all atoms and steps with an error of 1e-9, in one field.
+
+    Ions start from atoms within 45 degrees of the axis, of the tenth with the highest fields; half of them at rest, the
+    others with up to 1 eV along the surface. DOP853 gives the places of the reference (simulation/test_flights).
+    """
+    rows = []
+    for radius in radii:
+        emitter = Emitter(nickel_tip(radius, shank), n_threads=1)
+        evaporate(emitter, int(1.5 * emitter.sweep_interval))
+        positions, normals, fields, tip = emitter.positions, emitter.normals, emitter.fields, emitter.tip
+        tree = Octree(np.ascontiguousarray(positions), emitter.charges.copy())
+        random = np.random.default_rng(0)
+        cap = positions[:, 2] > np.hypot(positions[:, 0], positions[:, 1])
+        chosen = random.choice(np.flatnonzero(cap & (fields > np.quantile(fields[cap], 0.9))), ions, replace=False)
+        first, second = tangent_frame(normals[chosen])
+        angle, energy = random.uniform(0, 2 * np.pi, (ions, 1)), random.uniform(0, 1.0, (ions, 1))
+        energy[: ions // 2] = 0.0
+        velocities = np.sqrt(2 * energy) * (np.cos(angle) * first + np.sin(angle) * second)
+        starts = np.ascontiguousarray(positions[chosen] + 0.12 * normals[chosen])
+        settings = ae.simulation.FlightSettings()
+        places = []
+        for accuracy in (replace(settings, opening_angle=0.0, tolerance=1e-9), settings):
+            flier = flier_over(tree, tip, accuracy)
+            start = time.process_time()
+            end, _ = fly(flier, Journal(tip.positions, 1), np.full(ions, -1), 1, starts, velocities)
+            seconds = time.process_time() - start
+            ahead = (tip.apex + 1e8 - end[:, 2]) / end[:, 5]  # a detector at 100 mm
+            places.append(end[:, :2] + ahead[:, None] * end[:, 3:5])
+        errors = np.linalg.norm(places[1] - places[0], axis=1) / 1e3
+        rows.append(
+            {
+                "R [a]": radius,
+                "flights": ions,
+                "time per flight [us]": seconds / ions * 1e6,
+                "steps": flier.n_steps / ions,
+                "median [um]": float(np.median(errors)),
+                "95 % [um]": float(np.quantile(errors, 0.95)),
+                "largest [um]": float(errors.max()),
+            }
+        )
+    return {"title": "flights alone, detector at 100 mm", "rows": rows}
+
+
 def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
     """Hit positions of a run against exact flights in the exact field: converged charges, sums over all atoms."""
     simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
@@ -473,6 +517,7 @@ PARTS = {
     "solutions": solutions,
     "rates": rates,
     "flights": flights,
+    "alone": flight_errors,
     "charges": charge_errors,
     "potentials": potentials,
     "places": place_errors,

@@ -82,7 +82,8 @@ else:
         shank_length=2 * size * material.a,
         depth=6 * material.a,
     )
-    run = ae.Simulation(tip, seed=1).run(ions)
+    # charges whose lines are where measured ones are, as those of `apt-evap start`
+    run = ae.Simulation(tip, rule=ae.ConstantPotential(), seed=1).run(ions)
     run.save(folder / "run.h5")
 compression = ae.analysis.image_compression(run).compression
 distance = 100.0

@@ -345,8 +345,11 @@ cdef class ConstantPotential(FieldRule):
             self.value[slot] -= over
             if self.gaussian:
                 self.value[slot] -= hole.charge * self.sums.difference(s)
-        if self.sees_others:
-            FieldRule.removed(self, tree, hole)
+            if self.sees_others:
+                over /= s
+                self.field[slot, 0] -= over * dx
+                self.field[slot, 1] -= over * dy
+                self.field[slot, 2] -= over * dz
 
     cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil:
         # The potential of a neighbour plus the difference between the two places, in which the errors of distant cells
