@@ -35,6 +35,7 @@ from apt_evap._common.validation import (
 )
 
 _SETTING = "setting"
+_LONG = 10  # characters of a number that is written out
 T = TypeVar("T", bound=type)
 U = TypeVar("U")
 
@@ -205,7 +206,9 @@ def checked(
 def settings(cls: T) -> T:
     """Make a class of settings: a frozen dataclass that checks its fields, with its parameters in the docstring."""
     cls.__post_init__ = _check_all  # type: ignore[attr-defined]
-    dataclass(frozen=True, repr=cls.__repr__ is object.__repr__)(cls)
+    if cls.__repr__ is object.__repr__:
+        cls.__repr__ = _short  # type: ignore[method-assign, assignment]
+    dataclass(frozen=True, repr=False)(cls)
     cls.__doc__ = _documented(cls)
     cls._settings_class = cls  # type: ignore[attr-defined]
     return cls
@@ -389,20 +392,37 @@ def changed(thing: U, values: Mapping[str, Any]) -> U:
 # ---- text ----------------------------------------------------------------------------------------------------------
 
 
-def to_python(thing: Any, package: str = "ae.") -> str:
+def to_python(thing: Any, package: str = "ae.", text_of: Callable[[Any], str] = repr) -> str:
     """Python expression of settings, with this prefix of classes (str); fields with their default are left out.
 
-    After a prefix, a class that is not a top-level name is written with its package: ``ae.emission.Thermal``.
+    After a prefix, a class that is not a top-level name is written with its package: ``ae.emission.Thermal``. Values
+    that are not settings are written by `text_of`, all digits by default.
     """
-    return _python(thing, package)
+    return _python(thing, package, text_of)
 
 
-def _python(thing, package=""):
+def few_digits(value: Any) -> str:
+    """Representation of a value with at most six digits of each number that needs more (str)."""
+    if isinstance(value, float) and len(repr(value)) > _LONG:
+        return f"{value:.6g}"
+    if type(value) in (tuple, list):
+        inner = ", ".join(map(few_digits, value)) + "," * (type(value) is tuple and len(value) == 1)
+        return f"({inner})" if type(value) is tuple else f"[{inner}]"
+    return repr(value)
+
+
+def _short(self):
+    """`__repr__` of settings: all fields, with few digits."""
+    parts = [f"{item.name}={few_digits(getattr(self, item.name))}" for item in fields(self) if item.repr]
+    return f"{type(self).__qualname__}({', '.join(parts)})"
+
+
+def _python(thing, package="", text_of=repr):
     if not declared(type(thing)):
         if isinstance(thing, tuple | list) and any(declared(type(item)) for item in thing):
-            inner = ", ".join(_python(item, package) for item in thing)
+            inner = ", ".join(_python(item, package, text_of) for item in thing)
             return f"({inner},)" if len(thing) == 1 else f"({inner})"
-        return repr(thing)
+        return text_of(thing)
     parts, by_name = [], False
     for item in fields(thing):
         if not (item.init and item.repr):
@@ -411,7 +431,7 @@ def _python(thing, package=""):
         same = _same(content, default)
         by_name = by_name or bool(item.kw_only) or same
         if not same:
-            text = _python(content, package)
+            text = _python(content, package, text_of)
             parts.append(f"{item.name}={text}" if by_name else text)
     return f"{_name(type(thing), package)}({', '.join(parts)})"
 

@@ -15,7 +15,17 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from apt_evap._common.codec import checked, from_plain, is_settings, number, part, settings, to_plain, to_python
+from apt_evap._common.codec import (
+    checked,
+    few_digits,
+    from_plain,
+    is_settings,
+    number,
+    part,
+    settings,
+    to_plain,
+    to_python,
+)
 from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.validation import check_array, check_number, short_text
 from apt_evap._core.elementary import sine_and_cosine
@@ -112,7 +122,7 @@ class _Tangential:
     """Base of the built-in perturbations: `launch` from `tangential`."""
 
     def __repr__(self) -> str:
-        return to_python(self, "")
+        return to_python(self, "", few_digits)
 
     def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
         """Launch a batch of ions.

@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 import threading
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.search_process import sentence_of
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.stop_reason import StopReason
+from apt_evap.warnings import ResponseWarning
 
 _MINUTES = 1.0  # between checkpoints
 
@@ -93,6 +95,8 @@ def _simulate(settings, output, pipe):
         else:
             pipe.send((ions, n_ions))
 
+    # its text names a setting that the page has chosen; the file of the run has the number of inexact ions
+    warnings.simplefilter("ignore", ResponseWarning)
     try:
         config = read_config(settings)
         simulation = config.simulation()

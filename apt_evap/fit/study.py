@@ -207,7 +207,9 @@ class Study:
         plain = self.plain["optimum"]
         if plain.value <= ABOVE_NOISE * np.nan_to_num(plain.error):
             return "the uncorrected one is not above its noise"
-        if self.ceiling is not None and self.ceiling.value < LEAST_CEILING:
+        if self.ceiling is None:
+            return "the noise of the measured densities is not known"
+        if self.ceiling.value < LEAST_CEILING:
             return f"two halves of the measured ions reach only {self.ceiling}"
         return ""
 

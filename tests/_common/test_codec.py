@@ -104,6 +104,15 @@ def test_python_text_is_the_same_object(example):
     assert eval(to_python(example), {"ae": ae}) == example
 
 
+def test_numbers_of_a_representation_are_short():
+    """Not so those of `to_python`, which gives the same settings."""
+    third = 1 / 3
+    emission = ae.RollUp(ae.TruncatedNormal(third, 0.1))
+    assert repr(emission) == "RollUp(TruncatedNormal(0.333333, 0.1))" and repr(third) in to_python(emission)
+    registration = ae.Registration(third, 0.25, (third, 2.0))
+    assert repr(registration).startswith("Registration(rotation=0.333333, scale=0.25, shift=(0.333333, 2.0), ")
+
+
 @settings
 class Pulse:
     """Pulses.

@@ -601,6 +601,7 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.savez("specimen.npz", counts=measured.values, x_edges_mm=measured.x_edges, y_edges_mm=measured.y_edges)
     asked, state = [], ServerState()
+    measured = replace(measured, source="specimen.npz")
     explorer = Explorer(None, measured, measured_arguments=["specimen.npz"])
     opened = Opened(explorer, opened=lambda path, document: lambda: asked.append(path), state=state)
     index, panel = opened.page.index, opened.page.simulation
@@ -626,7 +627,9 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     run = tmp_path / "specimen_2.h5"  # nothing is replaced
     assert asked == [str(run)] and len(ae.load(run)) == 200 and (tmp_path / "specimen.toml").read_text() == "mine"
     assert panel.simulate.label == "simulate this specimen"
-    _, view = explorer_and_view(make_parser().parse_args(["explore", str(run), "specimen.npz"]))
+    beside, view = explorer_and_view(make_parser().parse_args(["explore", str(run), "specimen.npz"]))
+    start = index.settings(1.0, 1).registration["start"]  # the run is registered from there
+    assert beside.registration_options["start"].shift == pytest.approx(start.shift, abs=0.1)
     panels = read_config(run.with_suffix(".toml")).maps.panels
     assert view.perturbation == panels[1].perturbation and view.perturbation.energy == 0.35
     again = Opened(Explorer(None, measured, measured_arguments=["specimen.npz"]), state=state).page

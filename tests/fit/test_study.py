@@ -612,7 +612,8 @@ def test_a_score_is_corrected_only_above_its_noise_and_its_ceiling(twin):
     assert not sure.no_score and corrected in sure.score_text
     noisy = replace(sure, plain=sure.plain | {"optimum": Score(0.007, 0.013)})
     low = replace(sure, ceiling=Score(0.046, 0.01))
-    for study in (noisy, low):
+    densities = replace(sure, ceiling=None)
+    for study in (noisy, low, densities):
         assert study.no_score and corrected not in study.score_text and corrected not in repr(study)
     assert plain in low.score_text
     for verdict in ("doubtful", "not alike"):  # scores of unrelated maps may be larger than those of related ones
