@@ -205,7 +205,7 @@ def _compared_maps(search, best):
 
 
 def _rule_of_metal(run: Run) -> Perturbation | None:
-    """`RollUp.of_metal`, as `start` writes it; None unless the run is one of a pure metal at a constant potential."""
+    """`RollUp.of_metal`, as `start` writes it; None unless a pure metal at a constant potential has its responses."""
     charges = dict(run.settings.get("rule") or {}).get("name")
     crystal = Orientation.known(run.settings["tip"])
     if charges != "ConstantPotential" or run.emissions.charge_ratios is None or crystal is None:
@@ -213,7 +213,8 @@ def _rule_of_metal(run: Run) -> Perturbation | None:
     if crystal.material.cohesive_energy is None or len(set(run.elements)) > 1:
         return None
     scale = float(np.median(run.at_evaporation_field().energy_scales)) if run.units is None else 1.0
-    return RollUp.of_metal(crystal.material, energy_scale=scale)
+    rule = RollUp.of_metal(crystal.material, energy_scale=scale)
+    return rule if rule.height <= run.response_model.settings.height else None
 
 
 def _shares(cells, shape):

@@ -41,8 +41,8 @@ def main():
         parser.add_argument(f"--{metal}", required=True, nargs=2, metavar=("RUN", "HOPS"))
     options = parser.parse_args()
     warnings.simplefilter("ignore", ae.warnings.ResponseWarning)
-    figure, axes = plt.subplots(2, 5, figsize=(15, 6.6), layout="constrained", sharex="row", sharey="row")
-    for row, (metal, title) in zip(axes, TITLES.items(), strict=True):
+    figure, axes = plt.subplots(5, 2, figsize=(7.6, 16.5), layout="constrained", sharex="col", sharey="col")
+    for column, (metal, title) in zip(axes.T, TITLES.items(), strict=True):
         path, hops = getattr(options, metal)
         run, measured = ae.load(path), measured_fold(metal)
         orientation, projection = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
@@ -54,15 +54,16 @@ def main():
             numbers = " ".join(f"{amplitude(*pair):.2f}" for pair in pairs)
             panels[f"{name}\ncorrelation {fold.correlation(measured):.2f}; {numbers}"] = fold
         end = measured.angles[-1]
-        for ax, (text, fold) in zip(row, panels.items(), strict=True):
+        for ax, (text, fold) in zip(column, panels.items(), strict=True):
             extent = (-end, end, -end, end)
             image = ax.imshow(fold.flattened, origin="lower", extent=extent, cmap="inferno", vmin=0.4, vmax=1.7)
             ax.set_title(text, fontsize="medium")
             ax.set_facecolor("0.88")
-        row[0].set_ylabel("angle from the pole [degrees]")
-    for ax in axes[-1]:
-        ax.set_xlabel("angle from the pole [degrees]")
-    figure.colorbar(image, ax=axes, label="density / its mean nearby", extend="both", fraction=0.03)
+        column[-1].set_xlabel("angle from the pole [degrees]")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("angle from the pole [degrees]")
+    bar = {"extend": "both", "location": "bottom", "fraction": 0.02, "aspect": 40}
+    figure.colorbar(image, ax=axes, label="density / its mean nearby", **bar)
     figure.savefig(options.picture, dpi=85)
 
 

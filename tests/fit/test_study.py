@@ -834,9 +834,14 @@ def test_pictures(twin, tmp_path):
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # tails of the energies
 def test_the_rule_of_the_metal_is_a_baseline_that_finds_its_own_map():
     tip = ae.Tip("Ni", apex_radius=3.5, axis=(1, 1, 1), shank_length=3.5, offset_seed=1)
-    responses = ae.ResponseSettings(energy_limit=4.0)
-    run = ae.Simulation(tip, seed=1, rule=ae.ConstantPotential(), response_settings=responses).run(
-        1_500, progress=False
+    run, low = (
+        ae.Simulation(
+            tip,
+            seed=1,
+            rule=ae.ConstantPotential(),
+            response_settings=ae.ResponseSettings(energy_limit=4.0, height=height),
+        ).run(1_500, progress=False)
+        for height in (0.2, 0.1)
     )
     hidden = ae.RollUp.of_metal("Ni")
     real = run.at_evaporation_field()
@@ -854,3 +859,6 @@ def test_the_rule_of_the_metal_is_a_baseline_that_finds_its_own_map():
     assert studies[0].baselines["rule of the metal"].value == pytest.approx(
         studies[1].baselines["rule of the metal"].value, abs=0.02
     )
+    # its ions start 0.2 nm above a neighbour
+    study = ae.fit_energies(low, measured, grid, FitSettings(resamples=2), registration=HERE)
+    assert set(study.baselines) == {"unperturbed", "thermal"}
