@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap.cli._declared_options import add_declared
-from apt_evap.cli._options import add_reading, integer_type, numbers_type
+from apt_evap.cli._options import add_flight, add_reading, integer_type, numbers_type
 from apt_evap.cli._output import put
 
 _OF_FIT = (
@@ -66,6 +66,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar, no summary")
     parser.add_argument("--force", action="store_true", help="overwrite files not made by apt-evap")
     reading = add_reading(parser)
+    add_flight(reading)
     reading.add_argument("--perturbation", metavar="P", help="perturbation of the ions of MEASURED if it is a run")
 
 
@@ -117,7 +118,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _measured(options):
     """Ions or a map of MEASURED; the ions of a run under a perturbation."""
-    from apt_evap.cli._files import ions_of_map, read, select
+    from apt_evap.cli._files import ions_of_map, read, select, with_masses
     from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.detector_map import DetectorMap
     from apt_evap.simulation.run import Run
@@ -129,4 +130,6 @@ def _measured(options):
         return select(content.hits(read_perturbation(options.perturbation)), options)
     if options.perturbation is not None:
         raise ValueError(f"--perturbation is only for a run as MEASURED, {options.file!r} contains measured ions")
-    return content if isinstance(content, DetectorMap) else ions_of_map(content, options)
+    if isinstance(content, DetectorMap):
+        return content
+    return ions_of_map(with_masses(content, options), options)

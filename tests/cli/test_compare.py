@@ -18,7 +18,9 @@ from systems import MODES, PIPES
 
 import apt_evap as ae
 from apt_evap._common.codec import for_json
+from apt_evap.cli.compare import _measured
 from apt_evap.cli.main import main
+from apt_evap.cli.parser import make_parser
 from apt_evap.plot.report.html_page import read_report
 
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.2, 0.1))
@@ -261,3 +263,17 @@ def test_a_doubtful_registration_is_told_once_and_kept(folder, capsys):
 def test_a_registration_without_common_hits_is_refused(folder, capsys):
     away = ["--registration=0,1,5000,0"]
     assert "registration" in failed(capsys, "run.h5", "map.npz", "-o", "away", *QUICK, *away)
+
+
+def test_masses_follow_from_the_times_of_flight(monkeypatch):
+    """With --distance, --mass selects ions of a file that has times of flight only, as in the other commands."""
+    rng, n = np.random.default_rng(1), 4000
+    x, y = rng.uniform(-20, 20, (2, n))
+    time = np.where(rng.random(n) < 0.25, 500.0, 700.0)
+    hits = ae.Hits(x=x, y=y, time_of_flight=time, voltage=np.full(n, 5000.0))
+    monkeypatch.setattr("apt_evap.cli._files.read", lambda options: hits)
+    masses = hits.with_masses(90.0, 1.0).mass_to_charge
+    words = ["compare", "run.h5", "ions.raw", "--distance", "90", "--t0", "1"]
+    bounds = f"--mass={masses[time < 600].min() - 0.01},{masses[time < 600].max() + 0.01}"
+    selected = _measured(make_parser("compare").parse_args([*words, bounds]))
+    assert len(selected) == np.count_nonzero(time < 600)
