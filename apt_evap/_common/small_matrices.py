@@ -46,6 +46,25 @@ def products(first: ArrayLike, second: ArrayLike) -> Any:
     return total
 
 
+def left_inverse(matrix: Floats) -> Floats:
+    """Moore-Penrose inverse of a matrix whose columns are independent, shape (m, n) -> (n, m).
+
+    Gram-Schmidt orthogonalisation of the columns, and back substitution: much faster than `pseudo_inverse`.
+    """
+    columns = np.array(matrix.T, dtype=np.float64, order="C")  # each column is a row here
+    n = len(columns)
+    triangle = np.zeros((n, n))
+    for k in range(n):
+        triangle[k, k] = math.sqrt(float((columns[k] * columns[k]).sum()))
+        columns[k] /= triangle[k, k]
+        triangle[k, k + 1 :] = (columns[k + 1 :] * columns[k]).sum(axis=1)
+        columns[k + 1 :] -= triangle[k, k + 1 :, None] * columns[k]
+    for k in range(n - 1, -1, -1):
+        known = (triangle[k, k + 1 :, None] * columns[k + 1 :]).sum(axis=0)
+        columns[k] = (columns[k] - known) / triangle[k, k]
+    return columns
+
+
 def pseudo_inverse(matrix: Floats) -> Floats:
     """Moore-Penrose inverse of a small matrix, shape (m, n) -> (n, m).
 

@@ -10,15 +10,15 @@ from apt_evap.specimen.tip import estimated_atoms
 # Measured: resident memory of the program before a specimen is built, and after its pictures are drawn, 126 to 140 MB
 # for R = 8, 12, 20 and 30 a.
 _PROGRAM = 1.4e8  # bytes
-_BYTES_PER_ION = 1_520  # with the usual coefficients
+_BYTES_PER_ION = 3_050  # measured: peak memory with 14,000 and 2,000 ions (R = 12 a); at the end parts are joined
 # Milliseconds per ion of one thread, and their increase per factor e in the number of surface atoms: fits to the table
 # of speeds in docs/accuracy_and_speed.rst within 7 %, from R = 20 to 120 a, times 2 for a slower or busy processor.
 _REFERENCE = 21_591  # surface atoms
 _WITH_RESPONSES = 2 * 1.30, 2 * 0.15
 # Of other designs than the usual ones with 140 launches and 102 coefficients: processor times per ion of 30 launches
-# are 0.70, 0.69 and 0.66 times as long (R = 20, 40 and 80 a); coefficients are three float32.
+# are 0.70, 0.69 and 0.66 times as long (R = 20, 40 and 80 a); coefficients are three float32, twice at the end.
 _LAUNCHES, _PER_LAUNCH = 140, 1 / 350
-_COEFFICIENTS, _BYTES_PER_COEFFICIENT = 102, 12
+_COEFFICIENTS, _BYTES_PER_COEFFICIENT = 102, 24
 _ONE_FLIGHT = 2 * 0.32, 2 * 0.10
 _LEAST = 0.3  # [ms], of small tips
 _START = 2 * 3e-5  # seconds per surface atom, from the same table

@@ -63,11 +63,11 @@ def write_run(path: AnyPath, run: Any) -> None:
         _write(file, run)
 
 
-def _put(group, name, values, unit=None):
+def _put(group, name, values, unit=None, compress=False):
     *folders, name = name.split("/")
     for folder in folders:
         group = group[folder] if folder in group else put_group(group, folder, _OWN)
-    put_field(group, name, values, unit)
+    put_field(group, name, values, unit, compress=compress)
 
 
 def _write(file, run):
@@ -97,7 +97,7 @@ def _write(file, run):
         place = _place(column)
         if place != IONS:
             stored = values.astype(np.int8) if values.dtype == bool else values
-            _put(simulation, place.removeprefix(f"{_SIMULATION}/"), stored, column.unit)
+            _put(simulation, place.removeprefix(f"{_SIMULATION}/"), stored, column.unit, compress=True)
     for index, perturbation in enumerate(run.perturbations):
         put_text(simulation[f"flown/{index}"], "perturbation", json.dumps(described(perturbation)))
     for group, table in (("history", run.history), ("cap", run.cap)):
@@ -163,7 +163,8 @@ def _read(file, n):
     arrays = {}
     for column in columns:
         stored = np.int8 if column.dtype is np.bool_ else column.dtype
-        arrays[column.path] = file.read(_place(column), stored, (n, *column.row)).astype(column.dtype, copy=False)
+        values = file.read(_place(column), stored, (n, *column.row), compressed=True)
+        arrays[column.path] = values.astype(column.dtype, copy=False)
     _check_index(arrays["species"], "species", len(elements))
     _check_index(arrays["phase"], "phase", len(settings["tip"].get("phases", ())) or 1)
     check_sequence_of_ions(arrays["emissions/ions"], "ions")

@@ -49,8 +49,8 @@ def test_every_changed_bit_is_noticed(path, run, flips):
     def mark(name, item):
         needed = (SIMULATION in name and name != f"{SIMULATION}/perturbation") or name.endswith("evaporation_id")
         if isinstance(item, h5py.Dataset) and item.chunks and needed:
-            chunk = item.id.get_chunk_info(0)
-            is_read[chunk.byte_offset : chunk.byte_offset + chunk.size] = True
+            for chunk in map(item.id.get_chunk_info, range(item.id.get_num_chunks())):
+                is_read[chunk.byte_offset : chunk.byte_offset + chunk.size] = True
 
     with h5py.File(path) as file:
         file.visititems(mark)
@@ -130,7 +130,7 @@ def test_everything_that_is_read_has_a_checksum(path):
     def check(name, item):
         assert all(isinstance(item.attrs[each], str) for each in item.attrs if each in ("NX_class", "units"))
         if isinstance(item, h5py.Dataset) and item.shape and item.size:
-            assert (item.compression, item.compression_opts) == ("gzip", 0) and not item.dtype.hasobject, name
+            assert item.compression == "gzip" and not item.dtype.hasobject, name
 
     with h5py.File(path, libver=("v110", "v110")) as file:
         file.visititems(check)

@@ -3,7 +3,21 @@
 import numpy as np
 import pytest
 
-from apt_evap._common.small_matrices import lengths, matrix_product, products, pseudo_inverse, squared_lengths
+from apt_evap._common.small_matrices import (
+    left_inverse,
+    lengths,
+    matrix_product,
+    products,
+    pseudo_inverse,
+    squared_lengths,
+)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 1), (5, 5), (78, 56)])
+def test_left_inverse(shape, rng):
+    matrix = rng.normal(size=shape) * np.logspace(0, 3, shape[1])
+    np.testing.assert_allclose(left_inverse(matrix), np.linalg.pinv(matrix), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(left_inverse(matrix) @ matrix, np.eye(shape[1]), atol=1e-10)
 
 
 @pytest.mark.parametrize("shape", [(25, 15), (3, 6), (4, 4), (9, 1)])

@@ -27,4 +27,4 @@ def test_responses_with_fewer_launches_take_less_time(tmp_path):
     usual, other = estimated(tmp_path), estimated(tmp_path, designs)
     # measured with 30 launches; the time before the first ion is small
     assert other.hours / usual.hours == pytest.approx(0.70, rel=0.12)
-    assert usual.memory - other.memory == pytest.approx(12 * (102 - 7 - 16) * 10_000)
+    assert usual.memory - other.memory == pytest.approx(24 * (102 - 7 - 16) * 10_000)

@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "58a76daa6fe3ecaafae894cb86473b8bac1972abd8a0db03fc247df4af5e1c5c"
+FINGERPRINT = "92a3171e3dc7ffd389a1eefbf6dcd3276e75d49d5f539395c5a9c4a1abacf750"
 PROGRAM = """
 import warnings
 

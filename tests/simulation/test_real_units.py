@@ -56,7 +56,7 @@ def test_the_paths_are_those_of_the_simulated_voltage_at_scaled_energies(tip12, 
     for perturbation in (ae.Unperturbed(), ROLLED):
         one, two = oracle.hits(perturbation), scaled.hits(perturbation)[:60]
         # the responses are as exact as in their own tests: 0.05 mm at 100 mm; times deviate by up to 4.4e-5, as a group
-        # ends when its slowest launch is at `reach`, where the potential still falls (0.6e-5 with a reach of 30,000)
+        # ends when its slowest launch is at `reach`, where the potential still falls
         assert np.hypot(one.x - two.x, one.y - two.y).max() < 0.05
         assert one.time_of_flight == pytest.approx(two.time_of_flight, rel=6e-5)
 

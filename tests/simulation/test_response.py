@@ -8,6 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 import apt_evap as ae
 from apt_evap.detection.hits import Outcome
+from apt_evap.simulation.flight import response
 from apt_evap.simulation.flight.response import Responses, directions_and_times, fit_quantities
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
@@ -214,3 +215,29 @@ def test_a_launch_that_never_meets_the_plane_leaves_no_infinite_time():
     assert np.isfinite(coefficients).all()
     assert residual[0] < 1e-12 and np.isinf(residual[1])  # which flags the ion
     assert coefficients[1, 2] == pytest.approx([100.0, 0.0, 0.0, 0.0], abs=1e-4)
+
+
+# ---- in files ------------------------------------------------------------------------------------------------------
+
+
+def test_rounded_coefficients_move_no_hit(tip12, monkeypatch):
+    perturbations = ae.LateralVelocity(1.0, height=0.1), ae.RollUp(1.0, sharpness=0.5, height=0.1)
+    rounded = ae.Simulation(tip12, seed=3).run(100, progress=False)
+    steps = rounded.responses.rolled[:, :2].astype(float) * 2.0**20
+    np.testing.assert_array_equal(steps, np.rint(steps))
+    monkeypatch.setattr(response, "_rounded", lambda coefficients: coefficients)
+    exact = ae.Simulation(tip12, seed=3).run(100, progress=False)
+    for perturbation in perturbations:
+        one, two = rounded.hits(perturbation), exact.hits(perturbation)
+        apart = np.hypot(one.x - two.x, one.y - two.y)[one.detected & two.detected]
+        assert 0 < np.sqrt(np.mean(apart**2)) < 5e-4 and apart.max() < 2e-3  # mm; measured 3e-4, 8e-4
+        assert np.nanmax(np.abs(one.time_of_flight / two.time_of_flight - 1)) < 6e-6
+
+
+def test_a_file_has_700_bytes_an_ion(tip12, tmp_path):
+    run = ae.Simulation(tip12, seed=3).run(800, progress=False)
+    sizes = []
+    for part in (run[:200], run[:800]):
+        part.save(tmp_path / "run.h5")
+        sizes.append((tmp_path / "run.h5").stat().st_size)
+    assert 400 < (sizes[1] - sizes[0]) / 600 < 700  # measured 682, of thousands of ions 620 to 650; 1,500 in memory

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import apt_evap._core.polynomials as polynomials
 from apt_evap._common.codec import checked, count, settings, switch, to_python
-from apt_evap._common.small_matrices import pseudo_inverse
+from apt_evap._common.small_matrices import left_inverse, pseudo_inverse
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
 from apt_evap._core.elementary import sine_and_cosine
@@ -157,7 +157,7 @@ class Design:
             Root mean square residual of the first two quantities over the launches, per degree of freedom. Infinite if
             some launches are NaN (the coefficients are then the minimum norm solution for the others); NaN if all are.
         """
-        matrix, inverse = _matrices(self)
+        matrix, weights, inverse = _matrices(self)
         values = np.ascontiguousarray(values, np.float64)
         coefficients = polynomials.fit(inverse, values)
         freedom = max(1, len(matrix) - matrix.shape[1])
@@ -166,7 +166,8 @@ class Design:
         for ion in np.flatnonzero(~(np.isfinite(residual) & np.isfinite(values).all(axis=(1, 2)))):
             good = np.isfinite(values[ion]).all(axis=1)
             if good.any():
-                coefficients[ion] = polynomials.fit(_inverse_of(self, good), values[ion, good][None])[0]
+                some = pseudo_inverse(matrix[good] * weights[good, None]) * weights[good]
+                coefficients[ion] = polynomials.fit(np.ascontiguousarray(some), values[ion, good][None])[0]
                 residual[ion] = np.inf
         return np.ascontiguousarray(coefficients, np.float32), residual
 
@@ -231,15 +232,8 @@ def _launches_of(design):
 
 @functools.lru_cache
 def _matrices(design):
-    """Monomials of the launches of a design, and the matrix of the weighted fit."""
+    """Monomials of the launches of a design, their weights, and the matrix of the weighted fit."""
     matrix = design.monomials(design.launches)
-    return matrix, _inverse_of(design, np.ones(len(matrix), bool))
-
-
-def _inverse_of(design, launches):
-    """Matrix of the weighted fit to some of the launches, a mask."""
-    weights = np.ones(len(design.launches))
+    weights = np.ones(len(matrix))
     weights[: _first_launches(design)] = _WEIGHT
-    weights = weights[launches]
-    matrix = design.monomials(design.launches[launches])
-    return np.ascontiguousarray(pseudo_inverse(matrix * weights[:, None]) * weights)
+    return matrix, weights, left_inverse(matrix * weights[:, None]) * weights

@@ -49,8 +49,8 @@ from apt_evap.studies.sweep.working import run_sweep
 LOCK = ".lock"
 """Lock of the folder of a data set, which exists while a process writes into it."""
 _WAIT = 2.0  # seconds between two looks at runs that another process makes
-# Measured for runs of 60 to 2,000 ions with responses: 470 to 507 bytes per ion, 56 kB for the rest
-_RUN_BYTES_PER_ION, _RUN_BYTES = 510, 6e4
+# Measured for runs of 60 to 7,000 ions with responses: 620 to 670 bytes per ion, 120 to 160 kB for the rest
+_RUN_BYTES_PER_ION, _RUN_BYTES = 670, 1.6e5
 _TEXT_BYTES, _FILE_BYTES = 4000, 40_000  # measured: 2.5 kB of texts in an example, 20 kB of HDF5 in an empty file
 # Measured there: 2 s for 30 examples, with the import of the package; doubled as the times of the runs
 _RECORDING = 6e-5  # seconds per ion and example
