@@ -24,7 +24,7 @@ from apt_evap.maps.indexing.orientation_search import (
     search,
 )
 from apt_evap.maps.indexing.refine import bins_of, deviance, refine
-from apt_evap.maps.indexing.two_witnesses import angle_between
+from apt_evap.maps.indexing.two_criteria import angle_between
 
 SCALE, WIDTH = 60.0, 70.0
 ELEMENTS = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}
