@@ -24,7 +24,7 @@ from apt_evap.maps.indexing.orientation_search import (
     search,
 )
 from apt_evap.maps.indexing.refine import bins_of, deviance, refine
-from apt_evap.maps.indexing.two_witnesses import angle_between
+from apt_evap.maps.indexing.two_criteria import angle_between
 
 SCALE, WIDTH = 60.0, 70.0
 ELEMENTS = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}
@@ -414,8 +414,8 @@ def test_the_same_axis_at_another_scale_is_a_rival():
     found = quickly(sums, "Ni", scales=(44.0, 80.0))
     assert not found.decided
     assert sorted(candidate.projection.scale for candidate in found.candidates[:2]) == pytest.approx(
-        [50.0, 72.0], rel=0.02
-    )
+        [50.0, 72.0], rel=0.04
+    )  # each is refined on the sum
     for candidate in found.candidates[:2]:
         assert misorientation(candidate.orientation.matrix, orientation.matrix, proper("fcc")) < 1.0
     assert quickly(map, "Ni", scales=(44.0, 80.0)).decided  # one of the halves

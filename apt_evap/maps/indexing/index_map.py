@@ -24,7 +24,7 @@ from apt_evap.maps.indexing.marked_poles import check_places, contradictory_mark
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns, mixture
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, search
 from apt_evap.maps.indexing.refine import NO_STRETCH, resolution
-from apt_evap.maps.indexing.two_witnesses import Weighed, angle_between, dispersion_of, view_of, weighed
+from apt_evap.maps.indexing.two_criteria import Weighed, angle_between, dispersion_of, view_of, weighed
 from apt_evap.specimen.materials import as_material
 
 WIDEST, NARROWEST = 45.0, 12.0

@@ -1,4 +1,4 @@
-"""Orientations of a map by two witnesses: the likelihood of its counts, and the evidence of its local contrast.
+"""Orientations of a map by two criteria: the likelihood of its counts, and the evidence of its local contrast.
 
 The likelihood (`refine`) sees amplitudes and every count, but slow changes, a dark rim or one very bright line that the
 patterns do not have can mislead it. The evidence (`contrast_search`) sees edges of either sign and no amplitudes of
@@ -25,7 +25,7 @@ _EVERY = 7  # of the points of a polar picture: for angles
 
 
 class View(NamedTuple):
-    """What both witnesses see of a map."""
+    """A map as both criteria need it."""
 
     disc: Disc
     """Its field of view."""
@@ -49,7 +49,7 @@ class Weighed(NamedTuple):
 
 
 def view_of(disc: Disc) -> View:
-    """What both witnesses see of a map."""
+    """A map as both criteria need it."""
     return View(disc, bins_of(disc), picture_of(disc))
 
 
@@ -86,7 +86,7 @@ def weighed(
     bounds: tuple[float, float],
     marks: Sequence[Mark] = (),
 ) -> list[Weighed]:
-    """Refine orientations by both witnesses.
+    """Refine orientations by both criteria.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def weighed(
     starts : sequence of Start
         Orientations.
     n : int
-        Number of the best ones of each witness that are refined to the end.
+        Number of the best ones by each criterion that are refined to the end.
     bounds : tuple of float
         Smallest and largest scale [mm/rad].
     marks : sequence of Mark
