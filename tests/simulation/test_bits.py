@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "92a3171e3dc7ffd389a1eefbf6dcd3276e75d49d5f539395c5a9c4a1abacf750"
+FINGERPRINT = "4580e91f56ad35665efc1021e28ae4407bfd6a4206892d01545a8287c00bcbb6"
 PROGRAM = """
 import warnings
 

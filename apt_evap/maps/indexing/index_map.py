@@ -429,19 +429,18 @@ def _judged(measured, view, material, patterns, results, weights, n, bounds, mar
     margin = float(weights[0] - weights[1]) if len(weights) > 1 else math.inf
     decided = margin > DECIDED
     floor = f"{np.floor(margin):.0f}"  # 11.6 is not 12
-    next_score = scores[1] if len(scores) > 1 else 0.0
-    numbers = f"{scores[0]:.2f} of the structure instead of {next_score:.2f} (margin {floor}; {DECIDED:g} is needed)"
+    numbers = f"(margin {floor}; {DECIDED:g} is needed)"
     if not structured:
         decided, reason = False, "the map has no structure beyond its noise"
     elif contradiction:
         decided, reason = False, contradiction
     elif not marked and measured.is_counts and measured.ions < LEAST_IONS:
-        decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed; {numbers}"
+        decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed"
     elif decided:
-        reason = f"it explains more than any other orientation or scale, {numbers}"
+        reason = f"counts and local contrast fit it better than any other orientation or scale {numbers}"
     else:
         several = int(np.count_nonzero(weights > weights[0] - DECIDED))
-        reason = f"{several} orientations or scales explain the map about equally well, {numbers}"
+        reason = f"{several} orientations or scales explain the map about equally well {numbers}"
     return Indexing(measured, candidates, decided, reason)
 
 

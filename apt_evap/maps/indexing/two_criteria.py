@@ -14,7 +14,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.contrast_search import Terms, picture_of, places_of, refine_contrast
+from apt_evap.maps.indexing.contrast_search import Explained, Terms, picture_of, places_of, refine_contrast
 from apt_evap.maps.indexing.marked_poles import Mark
 from apt_evap.maps.indexing.orientation_search import Disc, Start
 from apt_evap.maps.indexing.refine import Bins, Refined, bins_of, directions_of, refine
@@ -53,7 +53,7 @@ def view_of(disc: Disc) -> View:
     return View(disc, bins_of(disc), picture_of(disc))
 
 
-def angle_between(first, second, group: Floats, radius: float) -> float:
+def angle_between(first: Refined | Explained, second: Refined | Explained, group: Floats, radius: float) -> float:
     """Angle between the crystal directions that two results give to the places of a disc, its RMS [degrees].
 
     Parameters

@@ -41,6 +41,7 @@ _COMMON = 0.5  # fraction of the points that must stay in the common area at a r
 _COMPLETE = 0.5  # fraction of the rotations for which this holds
 _INNER = 0.04  # radius around the point, in diameters, without azimuthal structure
 _PIXELS = FINE // 2  # across the diameter of the common area
+_REMEDY = "check the material, the axis and the radius of the tip"
 
 
 class Likeness(NamedTuple):
@@ -145,8 +146,8 @@ def _verdict(agreement, halves, doubtful):
     if agreement >= ALIKE:
         return Likeness("alike", agreement, halves, numbers)
     if agreement < UNLIKE:
-        return Likeness("not alike", agreement, halves, f"{numbers}: check the material and the axis")
-    return Likeness("doubtful", agreement, halves, f"{numbers}: {ALIKE:g} is needed; check the material and the axis")
+        return Likeness("not alike", agreement, halves, f"{numbers}: {_REMEDY}")
+    return Likeness("doubtful", agreement, halves, f"{numbers}: {ALIKE:g} is needed; {_REMEDY}")
 
 
 def _symmetry(map: DetectorMap, centre: complex) -> Floats:

@@ -397,7 +397,7 @@ class Twin:
         """Reason why constants that depend on the crystal are not given, "" if they are."""
         verdict = study.likeness.verdict
         if verdict == "not alike":
-            return "the maps are not alike: check the material and the axis"
+            return "the maps are not alike: check the material, the axis and the radius of the tip"
         if verdict == "doubtful" and self._facts.verdict != "indexed":
             return "the map does not decide its orientation, and it is doubtful that the maps are alike"
         return ""
