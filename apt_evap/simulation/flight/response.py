@@ -59,7 +59,7 @@ class ResponseSettings:
     >>> settings = ae.ResponseSettings(energy_limit=3.0)
     >>> run = ae.Simulation(tip, seed=1, response_settings=settings).run(50)
     >>> run.hits(ae.RollUp(2.5, sharpness=0.15, height=0.1))
-    <Hits: 50 ions, 46 detected from 'simulation, RollUp(2.5, sharpness=0.15, height=0.1)'; x, y, time_of_flight, ...>
+    <Hits: 50 ions, 50 detected from 'simulation, RollUp(2.5, sharpness=0.15, height=0.1)'; x, y, time_of_flight, ...>
     """
 
     energy_limit: float = number(
