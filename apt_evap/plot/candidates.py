@@ -1,5 +1,7 @@
 """A map with the poles and zone lines of the orientations that it may show, beside their predicted patterns."""
 
+import textwrap
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,8 @@ from apt_evap.maps.indexing.index_map import SHOWN, Indexing
 from apt_evap.plot._figure import new_figure
 from apt_evap.plot.map_figures import color_limits, detector_map
 from apt_evap.plot.pole_labels import poles
+
+_CHARACTERS = 12  # of a title, per inch
 
 
 def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.object_]:
@@ -28,11 +32,19 @@ def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.o
     check_kind(result, "result", Indexing, "an Indexing, the result of index")
     n = (1 if result.decided else SHOWN) if candidates is None else check_count(candidates, "candidates")
     shown = result.candidates[:n]
-    figure = new_figure((4.4 * (len(shown) + 1), 9.2))
-    figure.suptitle("\n".join([f"{result.verdict}: {result.reason}", *result.deciding_marks]), fontsize="medium")
-    grid = figure.subplots(2, len(shown) + 1, squeeze=False)
-    grid[1, 0].remove()
-    axes = np.concatenate([grid[0, :1], grid[:, 1:].T.ravel()])
+    if len(shown) == 1:
+        width = 13.2
+        figure = new_figure((width, 5.2))
+        axes = figure.subplots(1, 3)
+    else:
+        width = 4.4 * (len(shown) + 1)
+        figure = new_figure((width, 9.2))
+        grid = figure.subplots(2, len(shown) + 1, squeeze=False)
+        grid[1, 0].remove()
+        axes = np.concatenate([grid[0, :1], grid[:, 1:].T.ravel()])
+    lines = [f"{result.verdict}: {result.reason}", *result.deciding_marks]
+    wrapped = [textwrap.fill(line, int(_CHARACTERS * width)) for line in lines]
+    figure.suptitle("\n".join(wrapped), fontsize="medium")
     map = (
         result.map
         if result.map.smoothing or not result.map.is_counts

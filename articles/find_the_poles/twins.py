@@ -1,17 +1,17 @@
-"""Blind twins: maps of large tips with random orientations, indexed without their truth.
+"""Blind twins: maps of tips in random orientations, indexed without their truth.
 
-    python twins.py RUNS            # five tips with R = 50 a, about 40 minutes of one core, and 40 maps
-    python twins.py RUNS --small    # maps of 1,000 to 3,000 ions
+    python twins.py RUNS simulate Pt Ta     # runs of some tips, all by default: about 10 minutes of one core
+    python twins.py RUNS index Pt Ta        # eight maps of each, 10 s a map; --wrong: as another crystal structure
 
-The tips are not those of the master patterns: other axes, another radius, another offset of the lattice. The charging
-rule and the emissions are the same. Each map has a random tilt of up to 15 degrees, rotation, mirror, scale of 20 to 90
-mm/rad, half angle of 15 to 40 degrees, image compression, number of ions, and its centre is up to 5 degrees off. One in
-four is of ions that roll up, of ions that do not, unperturbed, and a mixture. Every other map is indexed with a scale
-that is known within 10 %.
+The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
+symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
+that the density is that of the tip. Each map has a random axis, rotation, scale of 20 to 90 mm/rad, half angle of 15 to
+40 degrees, image compression, one of five emissions or a mixture of some, 4,000 to 300,000 ions as far as the run has
+them, a centre up to 0.08 radii off, an efficiency that changes by up to 30 % to the rim, and up to 12 % of background.
 """
 
 import argparse
-import sys
+import math
 import time
 from pathlib import Path
 
@@ -22,88 +22,143 @@ import apt_evap as ae
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.orientation_search import disc_of
 
-sys.path.append(str(Path(__file__).parents[2] / "tools"))
-from master_patterns import simulated
-
-TIPS = (("Ni", 11), ("W", 11), ("Si", 11), ("Ni", 12), ("W", 12))  # element and seed
-RADIUS, SKIP, IONS, MAPS = 50, 20_000, 90_000, 8
-WRONG = {"Ni": "W", "W": "Ni", "Si": "Ni"}
-
-
-def blind_map(run, number, most):
-    """A map, its true projection, and the rotation of the specimen."""
-    random = np.random.default_rng(100 + number)
-    plain, rolled, still = (run.hits(each) for each in run.perturbations)
-    if number % 4 < 3:
-        hits = (plain, rolled, still)[number % 4]
-        x, y = hits.x, hits.y
-    else:
-        which = random.random(len(run)) < random.uniform(0.2, 0.8)
-        x, y = np.where(which, rolled.x, plain.x), np.where(which, rolled.y, plain.y)
-    seen = np.isfinite(x)
-    directions = ae.analysis.image_compression(run).projection.directions(np.column_stack([x, y])[seen])
-    scale, half_angle = random.uniform(20, 90), random.uniform(15, 40)
-    tilt, azimuth, mirror = random.uniform(0, 15), random.uniform(0, 2 * np.pi), random.random() < 0.5
-    turn = Rotation.from_rotvec(np.radians(tilt) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])).as_matrix()
-    flat = ae.detection.Projection(scale, mirror=mirror, compression=random.choice([1.5, 2.0, 4.0]))
-    places = flat.places(directions[directions[:, 2] > 0] @ turn.T)
-    centre = random.uniform(-5, 5, size=2) * scale / 55
-    places = places[np.hypot(*places.T) < np.radians(half_angle) * scale]
-    n = int(min(len(places), np.exp(random.uniform(np.log(3_000), np.log(60_000))), most))
-    places = places[random.permutation(len(places))[:n]] + centre
-    map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
-    return map, ae.detection.Projection(scale, tuple(centre), mirror, flat.compression), turn, half_angle
+TIPS = {  # radius [a], charging rule, events before the first ion, ions, seed of axis and offset
+    "Pt": (24, "constant", 4_000, 14_000, 61),
+    "Ag": (50, "Robin", 9_000, 18_000, 62),
+    "Ni": (160, "constant", 40_000, 24_000, 63),
+    "Ta": (28, "Robin", 3_000, 12_000, 64),
+    "Mo": (60, "constant", 9_000, 18_000, 65),
+    "Fe": (160, "Robin", 40_000, 24_000, 66),
+    "Ge": (22, "Robin", 5_000, 14_000, 67),
+    "Si": (60, "constant", 20_000, 20_000, 68),
+}
+MAPS = 8
+WRONG = {"fcc": "W", "bcc": "Ni", "diamond": "Ni"}
+EMISSIONS = (
+    ae.Unperturbed(),
+    ae.LateralVelocity(ae.TruncatedNormal(0.35, 0.35), 0.1),
+    ae.LateralVelocity(ae.TruncatedNormal(0.1, 0.1), 0.05),
+    ae.RollUp(ae.TruncatedNormal(0.35, 0.35), 1.0, 0.4, 0.1),
+    ae.RollUp(ae.TruncatedNormal(0.1, 0.1), 1.0, 0.8, 0.1),
+)
+MIXTURES = ((1, 3), (0, 1, 2), (3, 4), (0, 1, 2, 3, 4), (1, 2, 3, 4))
+CONE = math.radians(52)
+"""Largest angle from the axis of a run of the ions that are used."""
 
 
-def error(map, candidate, projection, matrix, group):
-    """Median angle between true and found directions in the inner half of the map [degrees], modulo the symmetry."""
-    disc = disc_of(map)
-    grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 5)]), -1).reshape(-1, 2) * disc.radius + disc.centre
-    truth = projection.directions(grid) @ matrix
-    found = candidate.projection.directions(grid) @ candidate.orientation.matrix
-    return min(np.degrees(np.arccos(np.clip(np.median(((found @ each.T) * truth).sum(1)), -1, 1))) for each in group)
+def simulated(element):
+    """Run of a tip along a random axis."""
+    radius, rule, skip, ions, seed = TIPS[element]
+    material = ae.material(element)
+    size = radius * material.a
+    axis = tuple(np.random.default_rng(seed).normal(size=3).tolist())
+    tip = ae.Tip(material, size, axis=axis, shank_length=size, depth=6 * material.a, offset_seed=seed)
+    simulation = ae.Simulation(
+        tip,
+        seed=seed,
+        rule=ae.Robin() if rule == "Robin" else ae.ConstantPotential(),
+        detector=ae.Detector(distance=100.0, width=500.0, projection="equidistant"),
+        response_settings=ae.ResponseSettings(energy_limit=4.0),
+    )
+    for _ in simulation.emitter.advance(skip):
+        pass
+    return simulation.run(ions, progress=False)
+
+
+class Crystal:
+    """Directions of the ions of a run in its crystal, for every emission."""
+
+    def __init__(self, run):
+        self.orientation = ae.Orientation.from_settings(run.settings["tip"])
+        self.group = point_group(self.orientation.material.structure)
+        real = run.at_evaporation_field()
+        projection = ae.analysis.image_compression(run).projection
+        self.ions = [_flattened(projection, real.hits(emission), self.orientation.matrix) for emission in EMISSIONS]
+
+    def map(self, seed):
+        """A map, its projection, the rotation from crystal to specimen, and what it is."""
+        random = np.random.default_rng(seed)
+        turn = Rotation.random(random_state=int(random.integers(1 << 31))).as_matrix()
+        half_angle, scale = math.radians(random.uniform(15, 40)), random.uniform(20, 90)
+        kind = int(random.integers(len(EMISSIONS) + len(MIXTURES)))
+        kinds = [kind] if kind < len(EMISSIONS) else MIXTURES[kind - len(EMISSIONS)]
+        projection = ae.detection.Projection(scale, compression=float(random.choice([1.5, 2.0, 4.0])))
+        centre = random.uniform(-0.08, 0.08, 2) * half_angle * scale
+        share = random.uniform(0.2, 0.8, len(kinds)) if len(kinds) > 1 else np.ones(1)
+        parts = []
+        for (directions, acceptance), part in zip((self.ions[k] for k in kinds), share, strict=True):
+            parts.append(directions[random.random(len(directions)) < part * acceptance])
+        crystal = np.concatenate(parts)
+        crystal = np.concatenate([crystal @ member.T for member in self.group])
+        crystal = crystal[(crystal @ turn.T)[:, 2] > math.cos(min(1.25 * half_angle + 0.1, 1.3))]
+        # number of equal directions within the cone of the run: places with more have more ions
+        axis = self.orientation.matrix[2]
+        covered = sum((crystal @ member @ axis > math.cos(CONE)).astype(int) for member in self.group)
+        chance = np.minimum(1, np.quantile(covered, 0.2) / np.maximum(covered, 1))
+        places = projection.places(crystal[random.random(len(crystal)) < chance] @ turn.T)
+        radius = half_angle * scale
+        places = places[np.hypot(*(places - centre).T) < radius]
+        efficiency = 1 + (places - centre) / radius @ random.uniform(-0.3, 0.3, 2)
+        places = places[random.random(len(places)) < efficiency / 1.5]
+        n = int(min(len(places), math.exp(random.uniform(math.log(4_000), math.log(300_000)))))
+        background = int(random.uniform(0, 0.12) * n)
+        distance, angle = radius * np.sqrt(random.random(background)), random.uniform(0, 2 * math.pi, background)
+        noise = centre + np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
+        places = np.concatenate([places[random.permutation(len(places))[: n - background]], noise])
+        detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
+        return detector_map, projection, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees"
+
+    def error(self, detector_map, candidate, projection, turn):
+        """Median angle of true and found directions in the inner half [degrees], for the best equal crystal."""
+        disc = disc_of(detector_map)
+        grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 5)]), -1).reshape(-1, 2) * disc.radius + disc.centre
+        truth = projection.directions(grid) @ turn
+        seen = candidate.projection.directions(grid) @ candidate.orientation.matrix
+        cosines = [np.median(((seen @ member.T) * truth).sum(1)) for member in self.group]
+        return math.degrees(math.acos(np.clip(max(cosines), -1, 1)))
+
+
+def _flattened(projection, hits, matrix):
+    """Directions in the crystal within the cone, and the chance of each for a density that depends on no radius."""
+    places = np.column_stack([hits.x, hits.y])
+    directions = projection.directions(places[np.isfinite(places).all(axis=1)])
+    angles = np.arccos(np.clip(directions[:, 2], -1, 1))
+    directions, angles = directions[angles < CONE], angles[angles < CONE]
+    edges = np.linspace(0, CONE, 9)
+    density = np.histogram(angles, edges)[0] / (np.cos(edges[:-1]) - np.cos(edges[1:]))
+    fit = np.polyfit(((edges[1:] + edges[:-1]) / 2) ** 2, np.log(np.maximum(density, 1)), 2)
+    smooth = np.exp(np.polyval(fit, angles**2))
+    return directions @ matrix, np.minimum(1, np.quantile(smooth, 0.3) / smooth)
 
 
 def main():
-    """Simulate what is missing, and index."""
+    """Simulate, or index."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder of the runs")
-    parser.add_argument("--small", action="store_true", help="1,000 to 3,000 ions")
+    parser.add_argument("what", choices=("simulate", "index"))
+    parser.add_argument("elements", nargs="*", metavar="ELEMENT", help=", ".join(TIPS))
     parser.add_argument("--wrong", action="store_true", help="index as another crystal structure")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for element, seed in TIPS:
-        path = options.runs / f"{element}_{RADIUS}_{seed}.h5"
-        if not path.exists():
-            simulated(element, RADIUS, SKIP, IONS, seed).save(path)
-        run = ae.load(path)
-        orientation = ae.Orientation.from_settings(run.settings["tip"])
-        group = point_group(orientation.material.structure)
+    for element in options.elements or TIPS:
+        path = options.runs / f"{element}_{TIPS[element][0]}.h5"
+        if options.what == "simulate":
+            if not path.exists():
+                simulated(element).save(path)
+            continue
+        crystal = Crystal(ae.load(path))
+        material = crystal.orientation.material
         for number in range(MAPS):
-            most = 1_000 * (1 + number % 3) if options.small else 10**9
-            map, projection, turn, half_angle = blind_map(run, number, most)
-            known = number % 2 == 0
-            bounds = (0.9 * projection.scale, 1.1 * projection.scale) if known else None
+            detector_map, projection, turn, what = crystal.map(100 * TIPS[element][4] + number)
             start = time.process_time()
-            found = ae.index(map, WRONG[element] if options.wrong else orientation.material, scales=bounds)
+            result = ae.index(detector_map, WRONG[material.structure] if options.wrong else material)
             seconds = time.process_time() - start
-            matrix = turn @ orientation.matrix
-            off = [error(map, each, projection, matrix, group) for each in found.candidates]
-            rows.append((found.decided, off[0], min(off), seconds))
+            errors = [crystal.error(detector_map, item, projection, turn) for item in result.candidates]
             print(
-                f"{element} {seed} map {number}: {map.ions:6,} ions, {half_angle:.0f} degrees, scale"
-                f" {'known' if known else 'free '} {found.verdict:9} off {off[0]:4.1f}, best candidate {min(off):4.1f},"
-                f" {seconds:.1f} s; {found.reason}",
+                f"{element} {TIPS[element][0]} a, map {number}: {detector_map.ions:7,} ions, {what}: {result.verdict:9}"
+                f" off {errors[0]:5.1f}, best candidate {min(errors):5.1f}, {seconds:4.1f} s; {result.reason}",
                 flush=True,
             )
-    decided, off, best, seconds = np.array(rows, float).T
-    wrong = np.mean((decided > 0) & (off > 3))
-    print(
-        f"{len(rows)} maps: first candidate within 2 degrees {np.mean(off < 2):.3f}, one of the candidates"
-        f" {np.mean(best < 2):.3f}, decided {decided.mean():.3f}, decided and wrong {wrong:.3f};"
-        f" {np.median(seconds):.1f} s, at most {seconds.max():.1f} s of processor time"
-    )
 
 
 if __name__ == "__main__":
