@@ -65,19 +65,19 @@ cdef double SCOUT_ANGLE = 0.8
 cdef double SCOUT_TOLERANCE = 3e-2
 
 # The field of distant sources is expanded about one ball for each part of a step, or about one for the whole step if
-# the balls of the parts are not smaller than SPLIT of it. FAR is the distance in radii of a ball from which sources are
-# expanded. Measured on Ni[111], R = 80 a, 119 launches of an ion, 450 launches against direct sums: with 2.5 / 2.75 / 3 / 3.5,
-# places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in 1.02 / 1.14 / 1.21
-# / 1.40 ms an ion.
+# the balls of the parts are not smaller than SPLIT of it. FAR is the distance in radii of a ball from which sources
+# are expanded. Measured on Ni[111], R = 80 a, 119 launches of an ion, 450 launches against direct sums: with 2.5 /
+# 2.75 / 3 / 3.5, places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in
+# 1.02 / 1.14 / 1.21 / 1.40 ms an ion.
 cdef double FAR = 3.0
 cdef double SPLIT = 0.8
 
-# A flight alone has one list of sources for several steps: at the start for a ball of AT_START lengths, later for the way
-# of AHEAD times the next step. Inside such a ball, most places see the cells under smaller angles than the largest one,
-# so LONE times the opening angle has the same error. Measured on Ni[111], R = 80 a, 300 flights against direct sums, half
-# of them at rest and half with up to 1 eV; with lists for every step / (2, 6, 1.2) / (5, 6, 1.25) / (1, 8, 1.25) / (12, 5,
-# 1.3), places deviate by 0.69 / 0.69 / 0.66 / 0.71 / 0.64 um (median) and 1.86 / 1.55 / 1.60 / 1.78 / 1.53 um (95 %), in
-# 133 / 96 / 94 / 92 / 122 us.
+# A flight alone has one list of sources for several steps: at the start for a ball of AT_START lengths, later for the
+# way of AHEAD times the next step. Inside such a ball, most places see the cells under smaller angles than the
+# largest one, so LONE times the opening angle has the same error. Measured on Ni[111], R = 80 a, 300 flights against
+# direct sums, half of them at rest and half with up to 1 eV; with lists for every step / (2, 6, 1.2) / (5, 6, 1.25) /
+# (1, 8, 1.25) / (12, 5, 1.3), places deviate by 0.69 / 0.69 / 0.66 / 0.71 / 0.64 um (median) and 1.86 / 1.55 / 1.60 /
+# 1.78 / 1.53 um (95 %), in 133 / 96 / 94 / 92 / 122 us.
 cdef double AHEAD = 5.0
 cdef double AT_START = 6.0
 cdef double LONE = 1.25
