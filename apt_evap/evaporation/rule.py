@@ -177,7 +177,7 @@ class ConstantPotential:
     )
     tolerance: float = number(
         "Largest residual of the charges of a patch, relative to the mean charge of the patch. Measured (R = 40 a): "
-        "errors of charges and fields are those with 1e-6 to two digits; with 3e-4 they are up to 1.15 times larger.",
+        "errors of charges and fields are those with 1e-5 to two digits; with 3e-4 they are up to 1.15 times larger.",
         default=1e-4,
         at_least=1e-6,
         at_most=1,

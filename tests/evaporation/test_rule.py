@@ -143,9 +143,9 @@ def test_potentials_are_kept_during_the_events(small_tip, rule):
         near = np.linalg.norm(emitter.positions - top, axis=1) < 8 * 0.249
         stored = COULOMB * emitter._core.rule.potentials[emitter._core.slots]
         exact = potentials_of(emitter)
-        # the patch is at the voltage, as it is stored: solved to 1e-5 of self term and mean charge
+        # the patch is at the voltage, as it is stored: solved to 1e-4 of self term and mean charge
         unit = COULOMB * emitter._core.rule.self_term * emitter.charges.mean()
-        assert stored[near] == pytest.approx(1000.0, abs=5e-5 * unit)
+        assert stored[near] == pytest.approx(1000.0, abs=2e-4 * unit)
         # what is stored is the sum over all charges: up to the cells, 2e-4, and the single precision of the changes
         assert stored == pytest.approx(exact, abs=2e-3 * unit), number
     # the full solution differs by the smooth remainder that a relaxation removes
