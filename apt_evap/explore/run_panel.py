@@ -57,6 +57,7 @@ class RunPanel:
         self._put_code = put_code
         self._search_before = search_before or (lambda then: then())
         self._confirmed = ""  # the file whose replacement was asked for
+        self._doubtful: Path | None = None  # settings of a map that is not decided
         half = (LEFT - 20) // 2
         self.file = TextInput(title="settings file", value=name, width=half)
         self.minutes = NumericInput(title="minutes of the run", value=10.0, mode="float", low=0.1, width=half)
@@ -157,7 +158,8 @@ class RunPanel:
         self.simulate.disabled = False
         self.file.value = str(path)
         self._written(f"wrote {path}: {made.cost}", made)
-        self._state.doubt = "" if made.indexing.decided else "not decided: this is the first candidate; "
+        if not made.indexing.decided:
+            self._doubtful = path
         self._start_or_stop()
 
     def _start_or_stop(self):
@@ -170,7 +172,7 @@ class RunPanel:
         if not path.is_file():
             self._show(f"{path} does not exist yet: write the settings first")
             return
-        self._progress.start(path)
+        self._progress.start(path, "not decided: this is the first candidate; " if path == self._doubtful else "")
 
 
 def _free_path(path: Path, text: str) -> Path:

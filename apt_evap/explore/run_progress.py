@@ -71,9 +71,9 @@ class RunProgress:
         self._state.run.stop()  # type: ignore[union-attr]
         return True
 
-    def start(self, settings: Path) -> None:
-        """Start the run of a settings file; its file is beside it."""
-        self._state.run = BackgroundRun(settings, settings.with_suffix(".h5"))
+    def start(self, settings: Path, doubt: str = "") -> None:
+        """Start the run of a settings file; its file is beside it; `doubt` is what is not sure about them."""
+        self._state.run, self._state.doubt = BackgroundRun(settings, settings.with_suffix(".h5")), doubt
         self._update()
 
     def _update(self):

@@ -318,9 +318,10 @@ def index(
     view = view_of(disc)
     sigma = resolution(disc, math.sqrt(low * high))
 
-    def results_of(material, patterns, n, starts=()):
+    def results_of(material, patterns, n, starts=(), searched=True):
         terms = Terms(material, patterns)
-        starts = [*starts, *search_contrast(view.picture, disc.radius, terms, (low, high), n)]
+        if searched:
+            starts = [*starts, *search_contrast(view.picture, disc.radius, terms, (low, high), n)]
         densities = np.concatenate([pattern.smoothed(sigma) for pattern in patterns])
         return weighed(view, terms, densities, starts, n, bounds, marks)
 
@@ -332,8 +333,7 @@ def index(
         results = results_of(material, patterns, _STARTS, starts)
     else:
         starts = [Start(_matrix_at(disc.centre, *start), start[1].scale, 0.0)]
-        densities = np.concatenate([pattern.smoothed(sigma) for pattern in patterns])
-        results = weighed(view, Terms(material, patterns), densities, starts, 1, bounds, marks)
+        results = results_of(material, patterns, 1, starts, searched=False)
     if bounds != (low, high):
         inside = [item for item in results if bounds[0] * 1.001 < item.fit.scale_at_centre < bounds[1] / 1.001]
         results = inside or results
