@@ -59,6 +59,7 @@ def execute(options: argparse.Namespace) -> int:
         check_output(saved, lambda path: False, options.force)
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
+    # drawn, not a selection of ions
     ranges, options.ranges = None if options.ranges is None else read_ranges(options.ranges), None
     hits = read(options)
     if not isinstance(hits, Hits):

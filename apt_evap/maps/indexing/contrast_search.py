@@ -43,7 +43,7 @@ from apt_evap.maps.indexing.orientation_search import (
     oriented,
     polar_grid,
 )
-from apt_evap.maps.indexing.refine import directions_of
+from apt_evap.maps.indexing.refine import STRETCH, directions_of
 from apt_evap.specimen.materials import Material
 
 NARROW, WIDE = 0.035, 0.12
@@ -59,7 +59,6 @@ _FLAT = 1e-6  # contrast of an image that has none
 _FAMILIES = 5  # of poles
 _LINE_WIDTH = np.radians(2.0)  # standard deviation: wider than most lines, for the steps of the search
 _POLE_RADIUS = 200.0  # lattice constants: the facet of planes d apart is sqrt(2 d / R) wide
-_STRETCH = 0.05  # standard deviation of the prior of the radial stretch at the rim, as in `refine`
 _STEPS, _FINE = 8, 0.02  # steps of a refinement at most; change of the evidence that ends it
 _DIFFERENCE = 4e-3  # [rad] of the numerical derivatives
 _FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms are filtered again
@@ -356,7 +355,7 @@ def refine_contrast(
         pictures /= norms[:, None]
         gram, cross = (pictures * areas) @ pictures.T, (pictures * areas) @ picture
         value, amplitudes = exact_evidence(gram, cross, terms.priors, terms.signed)
-        return value - (geometry[4] / _STRETCH) ** 2, amplitudes / norms, amplitudes @ pictures
+        return value - (geometry[4] / STRETCH) ** 2, amplitudes / norms, amplitudes @ pictures
 
     geometry = np.array([0.0, 0.0, 0.0, np.clip(math.log(start.scale), *limits), 0.0])
     value, amplitudes, model = judged(geometry)
@@ -365,7 +364,7 @@ def refine_contrast(
         here = sample(image, geometry)[0]
         slopes = np.stack([(sample(image, geometry + s)[0] - here) / _DIFFERENCE for s in _DIFFERENCE * np.eye(5)])
         left = picture - model
-        prior = np.array([0, 0, 0, 0, max(areas @ left**2, 1e-3) / (PIECES * _STRETCH**2)])
+        prior = np.array([0, 0, 0, 0, max(areas @ left**2, 1e-3) / (PIECES * STRETCH**2)])
         normal = (slopes * areas) @ slopes.T
         right = (slopes * areas) @ left - prior * geometry
         step = np.linalg.solve(normal + np.diag(prior + 1e-2 * np.diag(normal) + 1e-9), right)

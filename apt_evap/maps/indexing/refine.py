@@ -35,7 +35,8 @@ _LEAST = 0.05  # expected counts of a bin at least, where residuals are divided 
 _REACH = 5  # bins: residuals farther apart count as independent
 NO_STRETCH = -0.01
 """Radial stretch above which the projection of the result is equidistant."""
-_STRETCH = 0.05  # standard deviation of the prior of the radial stretch at the rim
+STRETCH = 0.05
+"""Standard deviation of the prior of the radial stretch at the rim."""
 
 
 class Bins(NamedTuple):
@@ -253,7 +254,7 @@ class _Likelihood:
             for mark, directions, target in zip(self._marks, self.mark_directions(geometry), self._targets, strict=True)
             if target is not None
         ]
-        return np.concatenate([*parts, [geometry[4] / _STRETCH]])
+        return np.concatenate([*parts, [geometry[4] / STRETCH]])
 
     def value(self, state: _State) -> float:
         """Deviance of the counts, and the squared deviations of the marks: what is minimised."""
