@@ -13,7 +13,7 @@ import numpy as np
 
 from apt_evap._common.codec import for_json
 from apt_evap._common.digits import rounded_text
-from apt_evap._common.files import open_for_reading, replace_file
+from apt_evap._common.files import open_for_reading, replace_file, sha256_of
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
@@ -44,7 +44,7 @@ RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
 """Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
 """Energy [eV], height of the start [nm] and sharpness of the emission, those of the master patterns."""
-_MEASURED = "# Measured: "  # before the name of the measured file
+_CONTENT = "SHA-256 of its content: "  # of the measured file
 ROLLS = 0.1
 """Fraction of the roll-up pattern below which no ion rolls up."""
 _SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
@@ -141,7 +141,7 @@ def registration_start_of(path: AnyPath, measured: DetectorMap) -> dict[str, Any
     Returns
     -------
     dict
-        Empty if the settings were made from a file of another name.
+        Empty if the settings were not made from the file of the map, as it is now.
 
     Raises
     ------
@@ -150,11 +150,19 @@ def registration_start_of(path: AnyPath, measured: DetectorMap) -> dict[str, Any
     """
     with open_for_reading(path) as file:
         text = file.read().decode()
-    name = text.splitlines()[1].removeprefix(_MEASURED)
-    if Path(name).name != Path(measured.source).name:
+    content = _content_of(measured)
+    if not content or comment(content) not in text.splitlines():
         return {}
     distance = check_number(tomllib.loads(text).get("detector", {}).get("distance"), "detector.distance", above=0)
     return registration_start(disc_of(measured).centre, distance / _SIMULATED_COMPRESSION)
+
+
+def _content_of(measured):
+    """Line with the digest of the file of a map; "" if the map is not of a file."""
+    try:
+        return f"{_CONTENT}{sha256_of(measured.source)}" if measured.source else ""
+    except (OSError, ValueError):  # a source that is no file, such as "simulation, RollUp(0.1)"
+        return ""
 
 
 def settings_of(
@@ -283,7 +291,8 @@ def _text(indexing, radii, size, lens, factors):
     limit = float(np.clip(_MOST_ENERGY * _VOLTAGE / (material.charge_state * volts), *_LIMITS))
     lines = [
         f"{MARK} {__version__}.",
-        comment(f"{_MEASURED.removeprefix('# ')}{indexing.map.source or 'a map'}"),
+        comment(f"Measured: {indexing.map.source or 'a map'}"),
+        *([comment(content)] if (content := _content_of(indexing.map)) else ()),
         *(() if indexing.decided else ("# NOT DECIDED: axis and rotation are those of the first candidate.",)),
         "",
         *_tip_lines(indexing, radii, size, lens, factors),

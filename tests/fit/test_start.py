@@ -54,14 +54,21 @@ def test_the_settings_are_those_of_the_map(found, tmp_path):
 def test_the_place_of_a_run_is_that_of_its_settings(found, tmp_path):
     """The registration of a run begins where its settings say, on the map that they were made from only."""
     _, indexing = found
-    map = replace(indexing.map, source="folder/W.npz")
+    path, other = tmp_path / "W.npz", tmp_path / "other" / "W.npz"
+    other.parent.mkdir()
+    path.write_bytes(b"one")
+    other.write_bytes(b"two")
+    map = replace(indexing.map, source=str(path))
     start = ae.fit.settings_of(replace(indexing, map=map), minutes=1)
     start.save(tmp_path / "w.toml")
-    read, made = registration_start_of(tmp_path / "w.toml", replace(map, source="W.npz")), start.registration
+    read, made = registration_start_of(tmp_path / "w.toml", map), start.registration
     assert read.keys() == made.keys() and read["scales"] == made["scales"] and read["rotations"] == made["rotations"]
     assert read["tolerance"] == pytest.approx(made["tolerance"], rel=1e-3)
     assert read["start"].shift == pytest.approx(made["start"].shift, abs=0.01)
-    assert registration_start_of(tmp_path / "w.toml", replace(map, source="Mo.npz")) == {}
+    for source in (str(other), "", "missing.npz"):  # the same name is not the same file
+        assert registration_start_of(tmp_path / "w.toml", replace(map, source=source)) == {}
+    path.write_bytes(b"another measurement")
+    assert registration_start_of(tmp_path / "w.toml", map) == {}
 
 
 def test_results_have_short_representations(found):
