@@ -497,11 +497,11 @@ def steps_off(study, truth):
 TWINS = {"roll-up": (ROLLUP, (1.0, 1.0, 0.155)), "lateral": (LATERAL, (0.0, 0.316, 0.3))}
 
 
-def measured_map(other, perturbation):
-    """Eight draws of the ions of another tip, in bins of 1.25 mm."""
+def measured_map(other, perturbation, draws=8):
+    """Some draws of the ions of another tip, in bins of 1.25 mm."""
     edges = np.linspace(-60, 60, 97)
     frame = ae.DetectorMap.from_array(np.ones((96, 96), int), edges, edges, is_counts=True)
-    runs = [replace(other, seed=seed) for seed in range(10, 18)]
+    runs = [replace(other, seed=seed) for seed in range(10, 10 + draws)]
     draws = [ae.DetectorMap.from_hits(run.hits(perturbation), like=frame).counts for run in runs]
     return replace(frame, values=sum(draws))
 
@@ -510,7 +510,7 @@ def measured_map(other, perturbation):
 def twin(request, run, other):
     """A study of a map with hidden energies."""
     hidden, truth = TWINS[request.param]
-    measured = measured_map(other, hidden)
+    measured = measured_map(other, hidden, draws=32)  # with 8, lateral energies leave the spread open: 0.01 to 0.4
     study = fit_energies(run, measured, request.param, registration=HERE, resamples=40, progress=False)
     return study, hidden, truth
 
@@ -519,7 +519,7 @@ def test_hidden_energies_are_found(twin):
     study, hidden, truth = twin
     _, spread_off, mean_off = steps_off(study, truth)
     assert mean_off <= 1
-    assert spread_off <= 3  # a score of 0.996 +- 0.006 hardly depends on spreads below a third: 3 with lateral energies
+    assert spread_off <= 1
     axes, found = (study.grid.rollup_fractions, study.grid.relative_spreads, study.grid.means), study.optimum
     best, hidden_cell = (
         tuple(axis.index(value) for axis, value in zip(axes, values, strict=True))
