@@ -39,8 +39,7 @@ from apt_evap.maps.indexing.orientation_search import (
     Start,
     about_axis,
     axes_of,
-    misorientation,
-    oriented,
+    distinct_starts,
     polar_grid,
 )
 from apt_evap.maps.indexing.refine import STRETCH, directions_of
@@ -289,19 +288,7 @@ def search_contrast(
             best = values.argmax(axis=1)
             for turn, column, value in zip(turns, best, values.max(axis=1), strict=True):
                 scored.append((value, scale, turn, mirror, azimuths[column]))
-    scored.sort(key=lambda entry: -entry[0])
-    starts: list[Start] = []
-    for value, scale, turn, mirror, angle in scored:
-        matrix = oriented(turn, mirror, angle)
-        if not any(
-            misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
-            and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
-            for other in starts
-        ):
-            starts.append(Start(matrix, float(scale), float(value)))
-            if len(starts) == n_max:
-                break
-    return starts
+    return distinct_starts(scored, proper, n_max, AXIS_STEP, SCALE_STEP)
 
 
 class Explained(NamedTuple):

@@ -213,13 +213,41 @@ def search(
                     score = score / norm - cost[int(mirror)]
                     best = int(np.argmax(score))
                     scored.append((score[best], scale, turn, mirror, azimuths[best]))
+    return distinct_starts(scored, proper, n_max, AXIS_STEP, SCALE_STEP)
+
+
+def distinct_starts(
+    scored: list[tuple[float, float, Floats, bool, float]],
+    proper: Floats,
+    n_max: int,
+    axis_step: float,
+    scale_step: float,
+) -> list[Start]:
+    """The best results of a search that are more than two steps from a better one.
+
+    Parameters
+    ----------
+    scored : list of tuple
+        Score, scale [mm/rad], turn of the axis, whether mirrored, and azimuth [rad] of each result; it is sorted.
+    proper : ndarray
+        Rotations of the point group, shape (n, 3, 3).
+    n_max : int
+        Largest number of results.
+    axis_step, scale_step : float
+        Steps of the search: of the axes [degrees], and of the logarithm of the scale.
+
+    Returns
+    -------
+    list of Start
+        The best first.
+    """
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []
     for score, scale, turn, mirror, angle in scored:
         matrix = oriented(turn, mirror, angle)
         if not any(
-            misorientation(matrix, other.matrix, proper) < 2 * AXIS_STEP
-            and abs(np.log(scale / other.scale)) < 2.5 * SCALE_STEP
+            misorientation(matrix, other.matrix, proper) < 2 * axis_step
+            and abs(np.log(scale / other.scale)) < 2.5 * scale_step
             for other in starts
         ):
             starts.append(Start(matrix, float(scale), float(score)))
