@@ -158,8 +158,7 @@ class RunPanel:
         self.simulate.disabled = False
         self.file.value = str(path)
         self._written(f"wrote {path}: {made.cost}", made)
-        if not made.indexing.decided:
-            self._doubtful = path
+        self._doubtful = None if made.indexing.decided else path
         self._start_or_stop()
 
     def _start_or_stop(self):
