@@ -17,7 +17,7 @@ from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.measured_ions import NUMBERED, IonSelection, MeasuredIons
-from apt_evap.fit.fit_energies import measured_map
+from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.start_settings import is_start, registration_start_of
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load

@@ -5,6 +5,7 @@ import shlex
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -25,7 +26,8 @@ from apt_evap.explore.marks import Overlay, overlay
 from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.placement import misplaced
 from apt_evap.fit.confirmation import confirmed
-from apt_evap.fit.fit_energies import BINS, measured_map
+from apt_evap.fit.indexed_registration import index_as_run, indexed_start
+from apt_evap.fit.measured_map import BINS, measured_map
 from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
 from apt_evap.maps.crystallography.directions import poles
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -227,6 +229,7 @@ class Explorer:
         """Name of the crystal of the measurement, if it is known and one of the table."""
         self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
+        self._searched = False  # whether the map was indexed for them
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
@@ -239,6 +242,7 @@ class Explorer:
         """Take the ions that are now selected of the file."""
         if isinstance(self.ions_of_file, MeasuredIons):
             self.measured = self.ions_of_file.hits
+            self._searched = False
             self._kept_maps, self._kept_picture = {}, (None, None)
 
     def keep_ions(self, other: "Explorer") -> None:
@@ -342,6 +346,8 @@ class Explorer:
         target = measured_map(self.measured)
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
+        call = apply or (lambda function, arguments: function(*arguments))
+        self._find_start(target, call)
         best: Registration | None = None
         registration: Registration | None
         failed = ValueError("perturbations must contain at least one perturbation, got none")
@@ -350,7 +356,7 @@ class Explorer:
         for done, perturbation in enumerate(perturbations, 1):
             arguments = self.run.hits(perturbation), target, self.registration_options
             try:
-                registration = _registration(*arguments) if apply is None else apply(_registration, arguments)
+                registration = call(_registration, arguments)
             except ValueError as error:  # such as a map that is too empty with this emission
                 registration, failed = None, error
             progress(done, len(perturbations))
@@ -363,6 +369,16 @@ class Explorer:
         self.set_registration(best)
         best.warn_if_doubtful()
         return best
+
+    def _find_start(self, target, call):
+        """Index the measured map for the crystal of the run, once: where the axis of the run is on it."""
+        if self.registration_options or self._searched:
+            return
+        indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"])))
+        self._searched = True
+        if indexing is not None and indexing.decided:
+            with suppress(ValueError):  # the axis of the run is not on the map
+                self.registration_options = indexed_start(self.run, indexing)
 
     def set_registration(self, registration: Registration) -> None:
         """Set the transform into the measured frame."""

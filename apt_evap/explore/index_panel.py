@@ -32,7 +32,7 @@ from apt_evap.explore.newest_task import NewestTaskRunner
 from apt_evap.explore.pole_panel import draw_poles, sparse_labels, with_gaps
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT
-from apt_evap.fit.fit_energies import measured_map
+from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.start_settings import StartSettings, settings_of
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Indexing, index

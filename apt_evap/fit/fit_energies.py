@@ -10,7 +10,7 @@ import numpy as np
 
 from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
-from apt_evap._common.validation import check_count, check_kind
+from apt_evap._common.validation import check_kind
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
@@ -22,20 +22,17 @@ from apt_evap.fit.energy_search import EnergySearch, register_repeatedly
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima
 from apt_evap.fit.intervals import intervals as intervals_of
+from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.fit.structure import PoleMeasure, StructureScores
 from apt_evap.fit.study import RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
-from apt_evap.maps.similarity import WINDOW
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 
-BINS = 128
 DRAWN = 10
 """Target ratio of simulated (all draws) to measured ions, with `FEWEST` to `MOST` draws per ion."""
 FEWEST, MOST = 4, 16
-FEWEST_IONS = 0.5
-"""Warning below this number of simulated ions per bin; studies of tutorials and twins have 1 to 10."""
 
 
 def fit_energies(
@@ -126,15 +123,25 @@ def fit_energies(
     check_kind(run, "run", Run, "a Run").require_responses()
     if registration is not None:
         check_kind(registration, "registration", Registration, "a Registration")
-    measured = measured_map(measured, settings.bins)
-    settings = _completed(settings, measured, run)
-    search = EnergySearch(run, measured, grid, settings, thread_count(n_threads), progress)
+    hits_or_map, asked = measured, settings.bins
+
+    def search_with(bins):
+        measured = measured_map(hits_or_map, bins)
+        completed = _completed(replace(settings, bins=bins), measured, run)
+        return EnergySearch(run, measured, grid, completed, thread_count(n_threads), progress)
+
+    search = search_with(asked)
     with warnings.catch_warnings():
         # once per energy; the settings contain the same information
         warnings.simplefilter("ignore", ResponseWarning)
         # the transform onto the measured map, which stays fixed from here on
         registration, rounds = (registration, []) if registration is not None else _registered(search)
         search.place(registration, settings.resamples)
+        # bins in which the run has enough ions, unless they are given
+        merged = isinstance(hits_or_map, DetectorMap)
+        if asked is None and (bins := bins_for_run(run, search.measured, registration, merged)) is not None:
+            search = search_with(bins)
+            search.place(registration, settings.resamples)
 
         # scores of the maps of all energies, for all ions and for each resample
         measure, missing = _pole_measure(search, registration, pole)
@@ -155,7 +162,7 @@ def fit_energies(
         structure = _structure_scores(measure, search, structures, maps, cells[0])
     registration.warn_if_doubtful()
     _warn_of_lost_lines(structure, settings)
-    _warn_of_few_ions(maps["unperturbed"].ions / search.comparison.mask.sum(), measured)
+    _warn_of_few_ions(maps["unperturbed"].ions / search.comparison.mask.sum(), asked)
     return Study(
         grid=grid,
         scores=values[0],
@@ -174,7 +181,7 @@ def fit_energies(
         maps=maps,
         structure=structure,
         settings=settings,
-        provenance=_provenance(run, measured, search, rounds, missing),
+        provenance=_provenance(run, search, rounds, missing),
     )
 
 
@@ -233,17 +240,18 @@ def _warn_of_lost_lines(structure, settings):
         )
 
 
-def _warn_of_few_ions(density, measured):
+def _warn_of_few_ions(density, bins):
     if density < FEWEST_IONS:
         warn(
             f"the run has {density:.2g} ions per compared bin, but a map needs at least {FEWEST_IONS:g}",
             MapWarning,
-            f"use fewer bins than {max(measured.values.shape)}, or simulate more ions",
+            f"{'' if bins is None else f'use fewer bins than {bins}, or '}simulate more ions",
         )
 
 
-def _provenance(run, measured, search, rounds, missing):
+def _provenance(run, search, rounds, missing):
     """Origin of a study: the maps, the run and the registration, in plain types."""
+    measured = search.measured
     energy_limit = run.response_settings.energy_limit / np.median(run.energy_scales)  # [eV] of this run
     provenance = {
         "map_bins": measured.values.shape[::-1],
@@ -357,46 +365,3 @@ def _replicas(measured, run):
     """Number of draws per ion for `DRAWN` times the measured ions; their number is not known for densities."""
     number = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
     return int(np.clip(np.ceil(number), FEWEST, MOST))
-
-
-def measured_map(measured: Hits | DetectorMap, bins: int | None = None) -> DetectorMap:
-    """Measured map, with about the requested number of bins along the longer side.
-
-    Parameters
-    ----------
-    measured : Hits or DetectorMap
-        Measured ions, or a map, whose bins are merged by an integer factor.
-    bins : int, optional
-        Number of bins, at least 11; by default 128 for ions, and those of a map.
-
-    Returns
-    -------
-    DetectorMap
-
-    Raises
-    ------
-    ValueError
-        If the number is too small or leaves no bin.
-    """
-    if bins is not None:
-        bins = check_count(bins, "bins", at_least=2 * WINDOW + 1)
-    if isinstance(measured, Hits):
-        return DetectorMap.from_hits(measured, bins=bins or BINS)
-    check_kind(measured, "measured", DetectorMap, "Hits or a DetectorMap")
-    if bins is None:
-        return measured
-    ny, nx = measured.values.shape
-    factor = max(1, round(max(nx, ny) / bins))
-    rows, columns = ny - ny % factor, nx - nx % factor
-
-    def blocks(values):
-        return values[:rows, :columns].reshape(rows // factor, factor, columns // factor, factor)
-
-    inside = blocks(measured.mask)
-    # a bin partly outside counts as outside
-    mask, values = inside.all(axis=(1, 3)), blocks(np.where(measured.mask, measured.values, 0)).sum(axis=(1, 3))
-    if not mask.any():
-        raise ValueError(f"bins={bins} leaves no bin inside {measured!r}")
-    x_edges, y_edges = measured.x_edges[: columns + 1 : factor], measured.y_edges[: rows + 1 : factor]
-    ions = int(values[mask].sum()) if measured.is_counts else None
-    return replace(measured, values=values, mask=mask, ions=ions, detected=None, x_edges=x_edges, y_edges=y_edges)

@@ -31,8 +31,8 @@ class FitSettings:
     """
 
     bins: int | None = count(
-        "Bins along the longer side. By default 128 for measured hits, and those of a map, whose bins are merged by an "
-        "integer factor to come closest to another number.",
+        "Bins along the longer side. By default 128 for measured hits, and those of a map, or fewer, at least 24, if "
+        "the run has less than 0.6 ions in each of them. The bins of a map are merged by an integer factor.",
         default=None,
         at_least=11,
         at_most=MAX_BINS,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,9 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import RollUp
 from apt_evap.emission.roll_probability import Migration
+from apt_evap.fit.indexed_registration import ENERGY, HEIGHT, ROLLS, SHARPNESS, registration_start
 from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.maps.indexing.orientation_search import disc_of
-from apt_evap.maps.registration.register import Registration
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
 
@@ -42,15 +41,9 @@ FIELD_FACTORS = 2.0, 8.0
 """Range of the field factors of usual specimens (Gault et al., Atom Probe Microscopy)."""
 RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
 """Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
-ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
-"""Energy [eV], height of the start [nm] and sharpness of the emission, those of the master patterns."""
 _CONTENT = "SHA-256 of its content: "  # of the measured file
-ROLLS = 0.1
-"""Fraction of the roll-up pattern below which no ion rolls up."""
 _SIMULATED_COMPRESSION = 1.03  # of free tips with R = 20 to 80 a: 1.02 to 1.045, measured with the master patterns
 _MARGIN = 1.1  # of the simulated field of view beyond the measured one
-# of the registration of a run: the indexing determines rotation, scale and place better than a search
-_ROTATIONS, _SCALES, _TILT = (-5.0, 5.0), (0.92, 1.08), math.radians(3.0)
 _ENDS = 1000  # ions at the beginning and at the end of a measurement, for its radii
 _PART = 0.2  # of the volume of the cap that may evaporate: the shape stays near the sphere
 _MOST_ENERGY = 2.5  # eV; of ions by the rule of a metal, one in ten million has more
@@ -59,26 +52,6 @@ _VOLTAGE = 1000.0  # V, of a simulation
 # flagged with 5 eV, 1,956 with 12.7
 _LIMITS = 1.5, 5.0
 _FEWEST, _MOST = 10_000, 150_000  # ions
-
-
-def registration_start(centre: Sequence[float], scale: float) -> dict[str, Any]:
-    """Start and bounds of the registration of a run with the settings of a `StartSettings`, for `register`.
-
-    Parameters
-    ----------
-    centre : sequence of float
-        Place of the axis on the map [mm].
-    scale : float
-        Of the indexed map [mm/rad].
-
-    Returns
-    -------
-    dict
-        start, rotations [degrees], scales, tolerance [mm].
-    """
-    x, y = centre
-    start = Registration(0.0, 1.0, (x, y))
-    return {"start": start, "rotations": _ROTATIONS, "scales": _SCALES, "tolerance": _TILT * scale}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,10 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.fit.fit_energies import fit_energies, measured_map
+from apt_evap.fit.fit_energies import fit_energies
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.study import Study
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load

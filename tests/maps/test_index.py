@@ -296,12 +296,14 @@ def test_half_angles_that_no_instrument_has_are_refused(options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mean", [0.5, 3.0])
-@pytest.mark.parametrize("shape", ["flat", "gradient", "half"])
+@pytest.mark.parametrize("shape", ["flat", "gradient", "half", "hot bins"])
 def test_noise_has_no_score(mean, shape):
     _, map = made("bcc", (0.1, 0.60, 0.80), ions=2_000)
     x = map.centres[0][None, :] / 35
-    expected = {"flat": 1 + 0 * x, "gradient": 1 + 0.6 * x, "half": 1.0 * (x > 0)}[shape] * mean
+    expected = {"flat": 1 + 0 * x, "gradient": 1 + 0.6 * x, "half": 1.0 * (x > 0)}.get(shape, 1 + 0 * x) * mean
     counts = np.random.default_rng(4).poisson(np.broadcast_to(expected, map.values.shape))
+    if shape == "hot bins":
+        counts[45, 70], counts[80, 30:32] = 5_000, 300
     found = quickly(ae.DetectorMap.from_array(counts, map.x_edges, map.y_edges, map.mask, is_counts=True), "W")
     assert not found.decided and "no structure" in found.reason
     assert [each.score for each in found.candidates] == [0.0] * len(found.candidates)

@@ -13,7 +13,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.fit.fit_energies import FEWEST_IONS, measured_map
+from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.studies.workflows import kept_files, twin_of_map
 from apt_evap.studies.workflows.kept_files import RECORD, KeptFiles
@@ -84,7 +84,7 @@ def quick(tmp_path, monkeypatch):
     monkeypatch.delattr(twin_of_map, "load")  # the simulated run is in memory
     monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
     monkeypatch.setattr(twin_of_map, "index", index)
-    monkeypatch.setattr(twin_of_map, "_registered", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
+    monkeypatch.setattr(twin_of_map, "register_near", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
     measurement("ni.epos")
     return calls
 
@@ -342,10 +342,11 @@ def test_a_twin_takes_as_many_bins_as_the_run_has_ions_for():
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
     for is_counts in (True, False):
         measured = ae.DetectorMap.from_array(np.ones((128, 128)), edges, edges, is_counts=is_counts)
-        assert twin_of_map.bins_for_run(Run(40_000), measured, here) is None
-        bins = twin_of_map.bins_for_run(Run(2_000), measured, here)
-        used = bins if is_counts else max(measured_map(measured, bins).values.shape)  # bins of a map are merged
-        assert 24 <= used and 2_000 / used**2 >= FEWEST_IONS
+        for merged in (True, False):
+            assert bins_for_run(Run(40_000), measured, here, merged) is None
+            bins = bins_for_run(Run(2_000), measured, here, merged)
+            used = max(measured_map(measured, bins).values.shape) if merged else bins
+            assert 24 <= used and 2_000 / used**2 >= FEWEST_IONS
 
 
 def test_an_advice_on_the_settings_of_a_twin_is_a_note():

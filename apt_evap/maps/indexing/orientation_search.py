@@ -37,6 +37,7 @@ _NARROW = 1 / 40  # radii of the field of view: smoothing of the measured map
 _RIM = 0.04  # radii of the field of view: its rim, where the density rises
 _HITS = 40  # in the area of a Gaussian, 4 pi sigma^2, for a noise of 16 %
 _DARK = 0.3  # of the median density: a rim and corners that are darker are not used
+_HOT, _HOT_ERRORS = 5, 10  # medians of the neighbours, and standard errors, above which a bin is hot
 _BRIGHTEST = 2.5  # mean densities: brighter points of map and pattern are set to this
 
 
@@ -68,6 +69,7 @@ def disc_of(map: DetectorMap) -> Disc:
         raise ValueError(f"the map must have hits, got {map!r}")
     values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
     mask = map.mask & field_of_view(np.where(map.mask, values, 0))
+    map = _without_hot_bins(map)
     width, height = map.bin_size
     size = np.sqrt(np.count_nonzero(mask) * width * height / np.pi)
     # as many hits in a smoothed point as in `field_of_view`
@@ -86,6 +88,20 @@ def disc_of(map: DetectorMap) -> Disc:
     x, y = map.centres
     centre = (float(np.interp(column, np.arange(len(x)), x)), float(np.interp(row, np.arange(len(y)), y)))
     return Disc(replace(map, mask=mask), centre, float(distance.max()))
+
+
+def _without_hot_bins(map):
+    """The map with the counts of every hot bin of a detector replaced by the median of its neighbours."""
+    if not map.is_counts:
+        return map
+    neighbours = np.ones((5, 5), bool)
+    neighbours[2, 2] = False
+    median = scipy.ndimage.median_filter(map.values, footprint=neighbours, mode="nearest")
+    hot = map.mask & (map.values > _HOT * median + _HOT_ERRORS * np.sqrt(median + 1))
+    if not hot.any():
+        return map
+    values = np.where(hot, median, map.values)
+    return replace(map, values=values, ions=int(values[map.mask].sum()), detected=None)
 
 
 def _distance(mask, bin_size):

@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,17 @@ from apt_evap.detection.hits import Hits
 from apt_evap.fit.fit_energies import fit_energies
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.indexed_registration import emission_of_pattern, index_as_run, indexed_start, register_near
+from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.study import Study
+from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
 from apt_evap.studies.workflows.simulate_file import Simulated, no_note
 from apt_evap.studies.workflows.written_pictures import check_output
-from apt_evap.warnings import RegistrationWarning, StructureWarning
+from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 
 STUDY, TABLE, OVERLAY, REPORT = "study.json", "scores.csv", "registration.png", "report.html"
 IN_LINES = (RegistrationWarning, StructureWarning)
@@ -63,7 +67,8 @@ def compare(
     settings : FitSettings, optional
         Bins, smoothing, draws and resamples.
     registration : Registration, optional
-        Carries simulated hits into the measured frame; by default found by `fit_energies`.
+        Carries simulated hits into the measured frame. By default the map is indexed, and if it decides, the run is
+        registered where its axis is on the map; otherwise it is searched by `fit_energies`.
     threads : int, optional
         Number of threads; by default the number of processors that this process may use.
     overwrite : bool
@@ -111,6 +116,8 @@ def compare(
         content = source.read()
         simulated, path = _run_and_file(run)
         simulated.require_responses("run" if path is None else repr(str(path)))
+        if registration is None:
+            registration = _indexed_registration(simulated, content, note)
         study = fit_energies(
             simulated, content, grid, settings, registration=registration, n_threads=threads, progress=progress
         )
@@ -144,6 +151,24 @@ def _run_and_file(run: Run | Simulated | AnyPath) -> tuple[Run, Path | None]:
     if isinstance(run, Simulated):
         return run.run, run.path
     return load(run), check_path(run)
+
+
+def _indexed_registration(run, measured, note):
+    """Registration where the axis of the run is on the measured map; None if the map does not decide."""
+    target = measured_map(measured)
+    indexing = index_as_run(target, Orientation.known(run.settings["tip"]))
+    if indexing is None or not indexing.decided:
+        return None
+    emission = emission_of_pattern(indexing.best.rolled, run.response_settings.height)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ResponseWarning)
+            registration = register_near(run.hits(emission), target, indexed_start(run, indexing))
+    except ValueError as error:
+        warn(f"{error}; so the run is registered by a search", MapWarning)
+        return None
+    note(f"the map shows {indexing.best}, where the run is registered")
+    return registration
 
 
 def _check_folder(folder: Path, overwrite: bool) -> None:

@@ -1,7 +1,6 @@
 """Twin of a measured specimen: its map is indexed, simulated, registered and fitted, with a report."""
 
 import json
-import math
 import os
 import shlex
 import warnings
@@ -11,8 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from apt_evap._common.codec import checked, choice, from_plain, number, settings, to_plain, vector
 from apt_evap._common.files import FileError, check_path, sha256_of
@@ -27,18 +24,23 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
-from apt_evap.emission.perturbations import LateralVelocity, RollUp, Unperturbed
-from apt_evap.fit.fit_energies import FEWEST_IONS
-from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
+from apt_evap.fit.indexed_registration import (
+    HEIGHT,
+    ROLLS,
+    SHARPNESS,
+    emission_of_pattern,
+    register_near,
+    registration_start,
+)
 from apt_evap.fit.measured_constants import Measurement, constants_of
-from apt_evap.fit.start_settings import ENERGY, HEIGHT, ROLLS, SHARPNESS, StartSettings, registration_start, settings_of
+from apt_evap.fit.start_settings import StartSettings, settings_of
 from apt_evap.fit.study import Study
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Candidate, Indexing, index
 from apt_evap.maps.indexing.master_pattern import master_patterns
-from apt_evap.maps.registration.register import Registration, at_bound, register
+from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import Material, as_material
@@ -46,7 +48,7 @@ from apt_evap.studies.workflows.compare_maps import IN_LINES, REPORT, compare
 from apt_evap.studies.workflows.kept_files import KeptFiles
 from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
 from apt_evap.studies.workflows.simulate_file import no_note, simulate
-from apt_evap.warnings import MapWarning, RegistrationWarning, WorkflowWarning, warn
+from apt_evap.warnings import MapWarning, warn
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
@@ -54,8 +56,6 @@ SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
 _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
 _BINS = 128  # of a map of ions
-_FEWEST_BINS = 24  # along the longer side of a comparison
-_MARGIN = 1.2  # of the ions in a bin, as the common region is smaller
 
 
 def _text(value, name):
@@ -332,12 +332,8 @@ class Twin:
     def _make_registration(self):
         self._kept.forget(ANSWER, _REPORT)
         best = self._facts.best
-        emission: RollUp | LateralVelocity = LateralVelocity(ENERGY, HEIGHT)
-        if self._rolls:
-            emission = RollUp(ENERGY, best.rolled, SHARPNESS, HEIGHT)
-        registration = _registered(
-            self.run.hits(emission), self.measured_map, registration_start(best.centre, best.scale)
-        )
+        hits = self.run.hits(emission_of_pattern(best.rolled))
+        registration = register_near(hits, self.measured_map, registration_start(best.centre, best.scale))
         self._kept.write({REGISTRATION: (json.dumps(to_plain(registration), indent=1) + "\n").encode()})
 
     def _compared(self, run, measured, folder):
@@ -347,14 +343,12 @@ class Twin:
         options = {"probability": _FRACTIONS, "sharpness": (SHARPNESS,), "height": (HEIGHT,)}
         grid = EnergyGrid("roll-up", options=options) if self._rolls else EnergyGrid("lateral", options=_HEIGHT)
         written = folder is not None
-        settings = FitSettings(bins=bins_for_run(self.run, self.measured_map, self.registration))
         with recorded_warnings(IN_LINES):
             return compare(
                 run,
                 measured,
                 folder,
                 grid,
-                settings,
                 registration=self.registration,
                 threads=self._threads,
                 progress=False if self._progress is False else None,
@@ -443,51 +437,6 @@ class Twin:
 
 
 _HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
-
-
-def _registered(hits, measured_map, bounds):
-    """Registration of a run; its scale is that of the indexing if the maps do not determine one within the bounds."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", RegistrationWarning)
-        registration = register(hits, measured_map, **bounds)
-    low, high = bounds["scales"]
-    if at_bound(registration.scale, (low, high)):
-        # poles of a smaller tip are wider, and a smaller scale makes them narrower again
-        text = f"the maps do not determine the scale of the registration within {low:g} to {high:g}: "
-        warn(f"{text}that of the indexing is kept", WorkflowWarning)
-        return register(hits, measured_map, **(bounds | {"scales": 1.0}))
-    for warning in caught:
-        warn(str(warning.message), RegistrationWarning)
-    return registration
-
-
-def bins_for_run(run: Run, measured: DetectorMap, registration: Registration) -> int | None:
-    """Bins along the longer side with enough ions of a run in each, None for the bins of the map.
-
-    Parameters
-    ----------
-    run : Run
-        The run.
-    measured : DetectorMap
-        The measured map.
-    registration : Registration
-        From the run into its frame.
-
-    Returns
-    -------
-    int or None
-        At least 24.
-    """
-    seen = registration.hits(run.hits(Unperturbed())).map(like=measured, position_step=None)
-    covered = measured.mask & seen.mask
-    ions, bins = int(seen.counts[covered].sum()), np.count_nonzero(covered)
-    if ions >= _MARGIN * FEWEST_IONS * bins:
-        return None
-    side = max(measured.values.shape)
-    if measured.is_counts:
-        return max(_FEWEST_BINS, int(side * math.sqrt(ions / (_MARGIN * FEWEST_IONS * bins))))
-    factor = math.ceil(math.sqrt(_MARGIN * FEWEST_IONS * bins / max(ions, 1)))  # of merged bins
-    return max(_FEWEST_BINS, side // factor)
 
 
 @contextmanager
