@@ -35,14 +35,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", metavar="PICTURE.png", help=".png, .pdf or .svg; default: FILE_spectrum.png in this folder"
     )
-    parser.add_argument("--force", action="store_true", help="overwrite a file not made by apt-evap")
+    parser.add_argument("--force", action="store_true", help="overwrite FILE.rrng, and a picture not made by apt-evap")
     add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap import plot
-    from apt_evap._common.files import check_path
+    from apt_evap._common.files import FileError, check_path
     from apt_evap.cli._files import read, select
     from apt_evap.detection.hits import Hits
     from apt_evap.detection.mass_spectrum import spectrum
@@ -56,7 +56,9 @@ def execute(options: argparse.Namespace) -> int:
     if saved is not None and saved.suffix.lower() != ".rrng":
         raise ValueError(f"--save must be a file .rrng, got {options.save!r:.80}")
     if saved is not None:
-        check_output(saved, lambda path: False, options.force)
+        if saved.exists() and not options.force:
+            raise FileError(f"{str(saved)!r} exists: --force overwrites it")
+        check_output(saved, lambda path: True, options.force)
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
     # drawn, not a selection of ions

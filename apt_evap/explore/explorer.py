@@ -26,7 +26,7 @@ from apt_evap.explore.marks import Overlay, overlay
 from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.placement import misplaced
 from apt_evap.fit.confirmation import confirmed
-from apt_evap.fit.indexed_registration import index_as_run, indexed_start
+from apt_evap.fit.indexed_registration import index_as_run, indexed_start, register_near
 from apt_evap.fit.measured_map import BINS, measured_map
 from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
 from apt_evap.maps.crystallography.directions import poles
@@ -823,6 +823,8 @@ class Explorer:
 def _registration(simulated, measured, options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
+        if "start" in options:
+            return register_near(simulated, measured, options)
         return register(simulated, measured, **options)
 
 

@@ -323,8 +323,8 @@ class IndexPanel:
 
     def _put_searched(self, indexing, text):
         rows = [] if indexing is None else [
-            (candidate.orientation, candidate.projection, f"score {candidate.score:.2f}")
-            for candidate in indexing.candidates
+            (candidate.orientation, candidate.projection, "less likely" if indexing.decided and n else indexing.verdict)
+            for n, candidate in enumerate(indexing.candidates)
         ]  # fmt: skip
         self._put(rows, text, indexing)
 

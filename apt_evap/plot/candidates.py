@@ -55,7 +55,7 @@ def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.o
         detector_map(map, ax, limits=limits, colorbar=False, caption=False)
     for number, (ax, below, candidate) in enumerate(zip(axes[1::2], axes[2::2], shown, strict=True), 1):
         poles(ax, candidate.orientation, candidate.projection, region=result.map, families=8)
-        ax.set_title(f"candidate {number}, score {candidate.score:.2f}\n{candidate}", fontsize="small")
+        ax.set_title(f"candidate {number}\n{candidate}", fontsize="small")
         detector_map(candidate.predicted(result.map), below, colorbar=False, caption=False)
         below.set_title(f"pattern of candidate {number}", fontsize="small")
     return axes

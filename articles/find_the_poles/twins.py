@@ -31,6 +31,7 @@ TIPS = {  # radius [a], charging rule, events before the first ion, ions, seed o
     "Fe": (160, "Robin", 40_000, 24_000, 66),
     "Ge": (22, "Robin", 5_000, 14_000, 67),
     "Si": (60, "constant", 20_000, 20_000, 68),
+    "Cu": (40, "constant", 6_000, 80_000, 69),
 }
 MAPS = 8
 WRONG = {"fcc": "W", "bcc": "Ni", "diamond": "Ni"}

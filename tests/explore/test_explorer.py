@@ -5,6 +5,7 @@ import re
 import shlex
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
 from apt_evap.explore.placement import misplaced
 from apt_evap.explore.specimen_surface import surface_atoms
+from apt_evap.fit.indexed_registration import index_as_run
 from apt_evap.fit.structure import PoleMeasure
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
@@ -290,6 +292,31 @@ def test_poles_over_the_maps(run20):
         assert math.hypot(*(place - TURNED.shift)) < 31.0
     bare = replace(run, settings={**run.settings, "tip": {"source": "a file"}})
     assert Explorer(bare).poles_over(Explorer(bare).show(settings)) is None
+
+
+def test_a_run_is_registered_where_the_indexed_map_has_its_axis(run20, measured, monkeypatch):
+    """The map is indexed once, in the process of the search; a map that does not decide gives no start."""
+    candidate = SimpleNamespace(
+        orientation=ae.Orientation("Ni", axis=(1, 1, 1)), projection=ae.detection.Projection(60.0, centre=(4.0, -3.0))
+    )
+    called = []
+    for decided in (True, False):
+        explorer = Explorer(run20, measured)
+        indexing = SimpleNamespace(decided=decided, best=candidate, map=measured.map(64))
+
+        def call(function, arguments, indexing=indexing):
+            called.append(function.__name__)
+            return indexing if function is index_as_run else ae.Registration(0.0, 0.5, arguments[2]["start"].shift)
+
+        if decided:
+            for _ in range(2):
+                explorer.register([ae.Unperturbed()], apply=call)
+            assert called == ["index_as_run", "_registration", "_registration"]
+            assert explorer.registration.shift == pytest.approx((4.0, -3.0), abs=0.01)
+        else:
+            with pytest.raises(KeyError, match="start"):
+                explorer.register([ae.Unperturbed()], apply=call)
+            assert explorer.registration_options == {}
 
 
 @pytest.mark.parametrize(("axis", "label", "fold"), [((0, 0, 1), "$002$", 4), ((0, 1, 1), "$022$", 2)])

@@ -645,7 +645,7 @@ def test_candidates_of_a_search_are_those_of_its_ions():
     rng = np.random.default_rng(5)
     x, y = rng.normal(size=(2, 2_000)) * 8.0
     hits = ae.Hits(x=x, y=y, mass_to_charge=rng.choice([14.0, 63.0], 2_000))
-    state, row = ServerState(), (ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0), "score 0.50")
+    state, row = ServerState(), (ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0), "undecided")
 
     def page_of(ions):
         return Opened(Explorer(None, ions, measured_arguments=["ions.epos"]), state=state).page
