@@ -20,6 +20,7 @@ from apt_evap.explore.upload import UploadHandler
 from apt_evap.maps.registration.register import Registration
 
 _ADDRESS = "127.0.0.1"
+_LIFETIME = 30 * 86_400  # s, of the token of a page: without a valid one a page that is loaded again stays empty
 
 
 class _StrangerFilter(logging.Filter):
@@ -126,6 +127,7 @@ def serve(
         extra_patterns=[("/upload", UploadHandler, {"key": key})],
         sign_sessions=True,
         generate_session_ids=False,
+        session_token_expiration=_LIFETIME,
         allow_websocket_origin=[f"{_ADDRESS}:{port}", f"localhost:{port}", *origins],
     )
     server.start()

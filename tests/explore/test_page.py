@@ -20,7 +20,7 @@ pytest.importorskip("bokeh")
 
 from bokeh.document import Document
 from bokeh.models import Slider, Spinner
-from bokeh.util.token import generate_jwt_token, generate_session_id
+from bokeh.util.token import generate_jwt_token, generate_session_id, get_token_payload
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
@@ -775,6 +775,17 @@ def test_connections_of_strangers_print_no_traceback(run, caplog):
     finally:
         server.stop()
     assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_a_page_can_be_loaded_again_after_days():
+    """Its token, which the page keeps, is valid as long as anybody has it open; that of Bokeh is for five minutes."""
+    server, url = serve(None)
+    try:
+        text = server.io_loop.run_sync(lambda: AsyncHTTPClient().fetch(url)).body.decode()
+    finally:
+        server.stop()
+    token = re.search(r'"token":"([^"]+)"', text)[1]
+    assert get_token_payload(token)["session_expiry"] > time.time() + 7 * 86_400
 
 
 def test_a_page_behind_a_proxy(caplog):
