@@ -107,6 +107,7 @@ def execute(options: argparse.Namespace) -> int:
             set_by_options(EnergyGrid),
             set_by_options(FitSettings),
             registration=None if options.registration is None else read_registration(options.registration),
+            distance=options.distance,
             threads=options.threads,
             overwrite=options.force,
             progress=False if options.quiet else None,

@@ -234,6 +234,11 @@ class Explorer:
             self.registration = self._same_size()
 
     @property
+    def distance(self) -> float | None:
+        """Flight length of the measured ions that was given [mm]."""
+        return self.ions_of_file.distance if isinstance(self.ions_of_file, MeasuredIons) else None
+
+    @property
     def is_comparison(self) -> bool:
         """Whether there are a run and a measurement."""
         return self.run is not None and self.measured is not None
@@ -374,7 +379,7 @@ class Explorer:
         """Index the measured map for the crystal of the run, once: where the axis of the run is on it."""
         if self.registration_options or self._searched:
             return
-        indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"])))
+        indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"]), self.distance))
         self._searched = True
         if indexing is not None and indexing.decided:
             with suppress(ValueError):  # the axis of the run is not on the map

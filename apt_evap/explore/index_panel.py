@@ -79,6 +79,8 @@ class IndexPanel:
     kept : dict, optional
         Crystal, marks and candidates; what an earlier page of this measurement left there is shown again, candidates of
         a search only for the same ions.
+    distance : callable, optional
+        Returns the flight length [mm], which bounds the scale of a search; None if it is not known.
     """
 
     def __init__(
@@ -89,10 +91,12 @@ class IndexPanel:
         later: Callable[[Callable[[], None], int], Any],
         put_code: Callable[[str], None],
         kept: dict[str, Any] | None = None,
+        distance: Callable[[], float | None] = lambda: None,
     ) -> None:
         self._kept: dict[str, Any] = {} if kept is None else kept
         self._after_search: Callable[[], None] | None = None
         self._measured, self._later, self._put_code = measured, later, put_code
+        self._distance = distance
         self._tasks = NewestTaskRunner()
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._indexing: Indexing | None = None  # of the search that gave the candidates
@@ -296,6 +300,8 @@ class IndexPanel:
             options["start"] = start
         elif self.scale.value:
             options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
+        else:
+            options["distance"] = self._distance()
         arguments = self._measured(), self.material.value
         label = button.label
         for search_button in (self.search, self.refine):

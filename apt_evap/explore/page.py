@@ -150,7 +150,7 @@ class Page:
         if explorer.measured is not None:
             self.index = IndexPanel(
                 figures, lambda: explorer.measured, self._material(), self._later, self.code.put_python,
-                state.indexed.setdefault(explorer.names[1], {}),
+                state.indexed.setdefault(explorer.names[1], {}), lambda: explorer.distance,
             )  # fmt: skip
             self.simulation = RunPanel(
                 self.index.settings, f"{Path(explorer.names[1]).stem}.toml", state, self._later,

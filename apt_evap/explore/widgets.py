@@ -23,13 +23,13 @@ _NARROWEST = 290  # px, of a map: two of them stand side by side in a window of 
 _ABOVE = 120  # px of the window above and below a map
 _RATIO = 0.9  # width over height of a map, with its axes and colour bar
 _WIDEST = f"{_RATIO} * max(300px, 100vh - {_ABOVE}px)"
-# one map has the tabs beside it, two maps only in a wide window
+# one map has the tabs beside it; two maps only if a window is so wide that its height limits them
 _WORK = f"""
 :host {{ display: grid; grid-template-columns: minmax(0, 1fr); gap: 12px; align-items: start; }}
 @media (min-width: 1150px) {{ :host(.one) {{ grid-template-columns: minmax(0, calc({_WIDEST})) minmax(360px, 1fr); }} }}
-@media (min-width: 1600px) {{
-  :host(.two) {{ grid-template-columns: minmax(0, calc(2 * {_WIDEST})) minmax(360px, 1fr); }}
-}}
+:host(.two) {{ display: flex; flex-flow: row wrap; }}
+:host(.two) > div {{ flex: 1 1 360px; }}
+:host(.two) > div:first-of-type {{ flex: 1 1 calc(2 * {_WIDEST}); max-width: calc(2 * {_WIDEST}); }}
 """
 
 # the frame of a figure is seldom square: the longer direction shows more, so that both have the same scale

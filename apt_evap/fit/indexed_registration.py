@@ -47,7 +47,7 @@ def registration_start(centre: Sequence[float], scale: float) -> dict[str, Any]:
     return _bounded(Registration(0.0, 1.0, (x, y)), scale)
 
 
-def index_as_run(measured: DetectorMap, crystal: Orientation | None) -> Indexing | None:
+def index_as_run(measured: DetectorMap, crystal: Orientation | None, distance: float | None = None) -> Indexing | None:
     """Index a map for the crystal of a run.
 
     Parameters
@@ -56,18 +56,20 @@ def index_as_run(measured: DetectorMap, crystal: Orientation | None) -> Indexing
         The measured map.
     crystal : Orientation or None
         Crystal of the run.
+    distance : float, optional
+        Flight length of the instrument [mm], which bounds the scale.
 
     Returns
     -------
     Indexing or None
         None if there is no crystal, there are no patterns of its structure, or the map cannot decide: it has fewer than
-        4,000 ions, or too few bins.
+        4,000 ions, too few bins, or no scale for this flight length.
     """
     if crystal is None or (measured.is_counts and (measured.ions or 0) < LEAST_IONS):
         return None
     try:
-        return index(measured, crystal.material)
-    except ValueError:  # no patterns, or a map that is too small
+        return index(measured, crystal.material, distance=distance)
+    except ValueError:  # no patterns, or a map that is too small, or one of another instrument
         return None
 
 

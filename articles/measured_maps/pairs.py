@@ -68,7 +68,8 @@ def main():
             related = ae.material(specimen[0]).structure == structures[map_name]
             settings = ae.fit.FitSettings(resamples=20)
             try:
-                study = ae.compare(run, measured, None, grid, settings, progress=False)
+                distance = 305.0 if map_name == "tungsten" else None  # mm
+                study = ae.compare(run, measured, None, grid, settings, distance=distance, progress=False)
             except ValueError as error:
                 print(f"{run_name:3} {map_name:9}: refused, {error}", flush=True)
                 continue

@@ -203,6 +203,7 @@ def test_maps_fill_the_window(page, width):
     boxes = [page.evaluate(f"area({number})") for number in (0, 1)]
     assert boxes[0][1] == pytest.approx(boxes[1][1], abs=2)  # side by side
     assert boxes[0][2] == pytest.approx(boxes[1][2], abs=2) and boxes[0][2] > (400 if width >= 1280 else 250)
+    assert width < 1920 or boxes[0][2] > 700  # tabs are not beside maps that could be larger
     sizes = page.evaluate("""() => {
       const sizes = []
       const visit = root => root.querySelectorAll("*").forEach(e => {

@@ -103,7 +103,7 @@ def registered(run20, monkeypatch):
     """Function of an indexing: the lines and the registration of a comparison of `run20` with its map."""
 
     def compared(indexing):
-        monkeypatch.setattr(compare_maps, "index_as_run", lambda measured, crystal: indexing)
+        monkeypatch.setattr(compare_maps, "index_as_run", lambda measured, crystal, distance: indexing)
         lines = []
         with pytest.raises(_Registered) as reached:
             ae.compare(run20, indexing.map, note=lines.append)

@@ -45,6 +45,7 @@ def compare(
     settings: FitSettings | None = None,
     *,
     registration: Registration | None = None,
+    distance: float | None = None,
     threads: int | None = None,
     overwrite: bool = False,
     progress: bool | None = None,
@@ -69,6 +70,8 @@ def compare(
     registration : Registration, optional
         Carries simulated hits into the measured frame. By default the map is indexed, and if it decides, the run is
         registered where its axis is on the map; otherwise it is searched by `fit_energies`.
+    distance : float, optional
+        Flight length of the instrument [mm], which bounds the scale of the indexing.
     threads : int, optional
         Number of threads; by default the number of processors that this process may use.
     overwrite : bool
@@ -117,7 +120,7 @@ def compare(
         simulated, path = _run_and_file(run)
         simulated.require_responses("run" if path is None else repr(str(path)))
         if registration is None:
-            registration = _indexed_registration(simulated, content, note)
+            registration = _indexed_registration(simulated, content, distance, note)
         study = fit_energies(
             simulated, content, grid, settings, registration=registration, n_threads=threads, progress=progress
         )
@@ -153,10 +156,10 @@ def _run_and_file(run: Run | Simulated | AnyPath) -> tuple[Run, Path | None]:
     return load(run), check_path(run)
 
 
-def _indexed_registration(run, measured, note):
+def _indexed_registration(run, measured, distance, note):
     """Registration where the axis of the run is on the measured map; None if the map does not decide."""
     target = measured_map(measured)
-    indexing = index_as_run(target, Orientation.known(run.settings["tip"]))
+    indexing = index_as_run(target, Orientation.known(run.settings["tip"]), distance)
     if indexing is None or not indexing.decided:
         return None
     emission = emission_of_pattern(indexing.best.rolled, run.response_settings.height)
