@@ -159,11 +159,11 @@ class RegistrationPanel:
     # ---- the verdict -----------------------------------------------------------------------------------------------
 
     def compare(self, maps: ExplorerMaps) -> None:
-        """Compute the verdict in any thread; it is shown if the maps are still these."""
+        """Compute the verdict in any thread; it is shown if the maps are still these, and no search goes on."""
         self._later(partial(self._put_likeness, maps, self._explorer.likeness(maps)), 0)
 
     def _put_likeness(self, maps, likeness):
-        if maps is self._maps:
+        if maps is self._maps and self._progress is None:  # the first emission of a search seldom fits
             self.likeness = likeness
             self._judged(maps, likeness)
 

@@ -95,6 +95,31 @@ def test_a_search_whose_process_is_killed_is_over(measured):
     assert not panel.refine.disabled and panel.search.label == "search" and "killed" in panel.text.text
 
 
+def test_a_flight_length_bounds_the_scale_of_a_search_unless_one_is_typed(measured, monkeypatch):
+    """In the explorer as in the command: tungsten is decided by its flight length."""
+    called = []
+
+    class Process:
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def call(self, function, arguments, options):
+            called.append(options)
+            raise ValueError("enough")
+
+    monkeypatch.setattr(index_panel, "SearchProcess", Process)
+    later = Later()
+    panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None, distance=lambda: 305.0)
+    for scale, expected in ((None, {"distance": 305.0}), (50.0, {"scales": (47.5, 52.5)})):
+        panel.scale.value = scale
+        panel._search(panel.search)
+        later.settle(lambda: not panel.search.disabled)
+        assert called.pop() == {"poles": [], "lines": []} | expected
+
+
 def test_any_error_of_a_search_is_told(measured, monkeypatch):
     later = Later()
     panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)
