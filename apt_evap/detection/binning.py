@@ -15,6 +15,7 @@ _CHUNK = 1 << 16
 
 FEWEST_SHOWN = 128
 """Least number of bins along a side of a picture."""
+_PART = 0.05  # of the hits of the largest part of a field of view: a part with fewer is stray
 MAX_BY_CHANCE = 32  # fewer different values may look quantised by chance: eight of a normal distribution did
 
 
@@ -227,8 +228,17 @@ def count(x: Floats, y: Floats, x_edges: Floats, y_edges: Floats) -> Integers:
     return total.reshape(ny, nx)
 
 
+def _on_a_line(region):
+    """Whether all bins of a region lie on one straight line, so that they have no hull."""
+    rows, columns = (places - places[0] for places in np.nonzero(region))
+    far = np.argmax(rows**2 + columns**2)
+    return not (rows * columns[far] - columns * rows[far]).any()
+
+
 def field_of_view(counts: Integers) -> Booleans:
     """Convex outline of the region where the density, averaged over 20 hits, exceeds a tenth of its median.
+
+    Dark zone lines may divide the region: all parts count that have 5 % of the hits of the largest one.
 
     Parameters
     ----------
@@ -248,7 +258,10 @@ def field_of_view(counts: Integers) -> Booleans:
     region = smooth > 0.1 * np.median(smooth[smooth > 0])
     labels, number = scipy.ndimage.label(region)
     if number > 1:
-        region = labels == 1 + np.argmax(scipy.ndimage.sum_labels(counts, labels, np.arange(1, number + 1)))
+        hits = scipy.ndimage.sum_labels(counts, labels, np.arange(1, number + 1))
+        region = np.isin(labels, 1 + np.flatnonzero(hits >= _PART * hits.max()))
+        if _on_a_line(region):
+            region = labels == 1 + np.argmax(hits)
     region &= scipy.ndimage.uniform_filter((counts > 0).astype(float), side, mode="constant") > 0
     if min(np.ptp(axis) for axis in np.nonzero(region)) == 0:  # one row or column has no hull
         return region

@@ -152,7 +152,11 @@ def main():
         for number in range(MAPS):
             detector_map, projection, turn, what = crystal.map(100 * TIPS[element][4] + number)
             start = time.process_time()
-            result = ae.index(detector_map, WRONG[material.structure] if options.wrong else material)
+            try:
+                result = ae.index(detector_map, WRONG[material.structure] if options.wrong else material)
+            except ValueError as error:  # a field of view with holes
+                print(f"{element} {TIPS[element][0]} a, map {number}: refused, {error}", flush=True)
+                continue
             seconds = time.process_time() - start
             errors = [crystal.error(detector_map, item, projection, turn) for item in result.candidates]
             print(

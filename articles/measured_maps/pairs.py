@@ -9,6 +9,7 @@ objective, uncorrected and corrected score of the best point. Runs are kept in t
 """
 
 import argparse
+import math
 import warnings
 from pathlib import Path
 
@@ -26,6 +27,7 @@ SECOND = {  # the same, with an emission
     "Si, 2nd": ("Si", 16, (0.05, 0.0, 1), 20_000, ae.RollUp(ae.TruncatedNormal(0.3, 0.3), 0.7, 0.4, 0.1)),
 }
 
+SMALLER, FIELD_OF_VIEW = 0.3, math.radians(38.0)  # measured mm per simulated mm, half angle of the second specimens
 STRUCTURES = {"nickel": "fcc", "aluminium": "fcc", "tungsten": "bcc"}
 
 
@@ -57,8 +59,9 @@ def main():
     structures = dict(STRUCTURES)
     for name, (*specimen, emission) in SECOND.items():
         run = run_of(options.folder, name, *specimen)
-        moved = ae.Registration(50.0, 0.3, (2.0, -1.0)).hits(run.hits(emission))
-        maps[name] = ae.Hits(x=moved.x, y=moved.y).map(bins=96)
+        moved = ae.Registration(50.0, SMALLER, (2.0, -1.0)).hits(run.hits(emission))
+        radius = SMALLER * ae.analysis.image_compression(run).projection.scale * FIELD_OF_VIEW
+        maps[name] = ae.Hits(x=moved.x, y=moved.y).within_circle(radius, (4.0, -1.0)).map(bins=64)
         structures[name] = ae.material(specimen[0]).structure
     grid = ae.fit.EnergyGrid("roll-up", options={"probability": (0.0, 0.5, 1.0)}, relative_spreads=(0.1, 1.0))
     warnings.simplefilter("ignore")

@@ -158,6 +158,16 @@ def test_field_of_view_is_the_disc():
     assert np.array_equal(map.mask[away], grid[away] < 10)
 
 
+def test_dark_lines_do_not_divide_a_field_of_view(rng):
+    """Without roll-up zone lines have no hits at all; the smaller part was cut off."""
+    places = rng.uniform(-30, 30, (60_000, 2))
+    places = places[np.hypot(*places.T) < 30]
+    dark = (np.abs(places[:, 1] + 8) < 1.5) | (np.abs(places[:, 0] - 12) < 1.5)
+    whole = Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
+    divided = Hits(x=places[~dark, 0], y=places[~dark, 1]).map(like=whole)
+    assert field_of_view(divided.counts).sum() == pytest.approx(whole.mask.sum(), rel=0.02)
+
+
 def test_field_of_view_keeps_dark_poles_and_drops_stray_hits():
     x, y = disc(100_000)
     dark = np.hypot(x - 3, y) > 2

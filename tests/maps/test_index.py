@@ -309,6 +309,18 @@ def test_noise_has_no_score(mean, shape):
     assert [each.score for each in found.candidates] == [0.0] * len(found.candidates)
 
 
+def test_dark_lines_do_not_divide_the_disc():
+    """Lines without hits that reach the rim are inside: what they cut off was left out, and a wrong result decided."""
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=60_000)
+    x, y = np.meshgrid(*map.centres)
+    whole = disc_of(map)
+    for dark in (np.abs(y + 8) < 1.5, np.abs(x - 0.4 * y - 5) < 1.5, (np.abs(y + 8) < 1.5) | (np.abs(x - 12) < 1.5)):
+        cut = disc_of(replace(map, values=np.where(dark, 0, map.values)))
+        assert cut.radius == pytest.approx(whole.radius, rel=0.03)
+        assert cut.centre == pytest.approx(whole.centre, abs=0.03 * whole.radius)
+        assert np.count_nonzero(cut.map.mask) > 0.97 * np.count_nonzero(whole.map.mask)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("kind", ["zeros", "one hot bin", "row", "thin", "few bins"])
 def test_maps_that_are_none_are_refused(kind):

@@ -37,6 +37,7 @@ _NARROW = 1 / 40  # radii of the field of view: smoothing of the measured map
 _RIM = 0.04  # radii of the field of view: its rim, where the density rises
 _HITS = 40  # in the area of a Gaussian, 4 pi sigma^2, for a noise of 16 %
 _DARK = 0.3  # of the median density: a rim and corners that are darker are not used
+_LINE = 0.1  # radii of the field of view: dark lines up to twice as wide do not divide it
 _HOT, _HOT_ERRORS = 5, 10  # medians of the neighbours, and standard errors, above which a bin is hot
 _BRIGHTEST = 2.5  # mean densities: brighter points of map and pattern are set to this
 
@@ -75,8 +76,8 @@ def disc_of(map: DetectorMap) -> Disc:
     # as many hits in a smoothed point as in `field_of_view`
     hits = max(float(values[mask].sum()), 1.0)
     smoothed = map.smoothed(max(_RIM, np.sqrt(_HITS / (4 * hits))) * size).values
-    # dark poles are inside
-    mask &= scipy.ndimage.binary_fill_holes(smoothed > _DARK * np.median(smoothed[mask]))
+    # dark poles are inside, and so are dark lines that end at the rim
+    mask &= scipy.ndimage.binary_fill_holes(_closed(smoothed > _DARK * np.median(smoothed[mask]), map.bin_size, size))
     mask = _distance(mask, map.bin_size) > _RIM * size
     labels, n = scipy.ndimage.label(mask)
     if not n:
@@ -88,6 +89,16 @@ def disc_of(map: DetectorMap) -> Disc:
     x, y = map.centres
     centre = (float(np.interp(column, np.arange(len(x)), x)), float(np.interp(row, np.arange(len(y)), y)))
     return Disc(replace(map, mask=mask), centre, float(distance.max()))
+
+
+def _closed(mask, bin_size, size):
+    """A mask with the dark lines between its parts filled: closed by a circle."""
+    radius = _LINE * size
+    far = int(np.ceil(radius / min(bin_size))) + 1
+    # farther than a radius from all that is within a radius of the mask, beyond the edges of the map, too
+    near = scipy.ndimage.distance_transform_edt(~np.pad(mask, far), sampling=bin_size[::-1]) <= radius
+    closed = scipy.ndimage.distance_transform_edt(near, sampling=bin_size[::-1]) > radius
+    return mask | closed[far:-far, far:-far]
 
 
 def _without_hot_bins(map):
