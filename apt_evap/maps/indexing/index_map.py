@@ -36,7 +36,7 @@ DIFFERENT = 6.0
 different results [degrees]: in orientation, or in scale."""
 DECIDED = 20.0
 """Margin to the next different result above which a map decides, see the notes of `index`. Chosen with measured maps
-of nickel (margin 23) and tungsten (24); tungsten as fcc reaches 22, but as bcc it has the larger weight."""
+of nickel (margin 23) and tungsten (23); tungsten as fcc reaches 22, but as bcc it has the larger weight."""
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
 below 3,100 ions (articles/find_the_poles)."""
