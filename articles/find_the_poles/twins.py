@@ -1,7 +1,7 @@
 """Blind twins: maps of tips in random orientations, indexed without their truth.
 
     python twins.py RUNS simulate Pt Ta     # runs of some tips, all by default: half an hour of one core
-    python twins.py RUNS index Pt Ta        # eight maps of each, 10 to 26 s a map; --wrong: as another crystal structure
+    python twins.py RUNS index Pt Ta        # eight maps of each, 10 to 26 s a map; --wrong: as another structure
 
 The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
 symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
