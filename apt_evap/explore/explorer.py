@@ -229,7 +229,7 @@ class Explorer:
         """Name of the crystal of the measurement, if it is known and one of the table."""
         self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
-        self._searched = False  # whether the map was indexed for them
+        self._indexed_start: dict[str, Any] | None = None  # the same by an indexing of these ions; {} if undecided
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
@@ -247,7 +247,7 @@ class Explorer:
         """Take the ions that are now selected of the file."""
         if isinstance(self.ions_of_file, MeasuredIons):
             self.measured = self.ions_of_file.hits
-            self._searched = False
+            self._indexed_start = None
             self._kept_maps, self._kept_picture = {}, (None, None)
 
     def keep_ions(self, other: "Explorer") -> None:
@@ -352,14 +352,14 @@ class Explorer:
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
         call = apply or (lambda function, arguments: function(*arguments))
-        self._find_start(target, call)
         best: Registration | None = None
         registration: Registration | None
         failed = ValueError("perturbations must contain at least one perturbation, got none")
         progress = progress or (lambda done, number: None)
         progress(0, len(perturbations))
+        options = self._start(target, call)
         for done, perturbation in enumerate(perturbations, 1):
-            arguments = self.run.hits(perturbation), target, self.registration_options
+            arguments = self.run.hits(perturbation), target, options
             try:
                 registration = call(_registration, arguments)
             except ValueError as error:  # such as a map that is too empty with this emission
@@ -375,15 +375,18 @@ class Explorer:
         best.warn_if_doubtful()
         return best
 
-    def _find_start(self, target, call):
-        """Index the measured map for the crystal of the run, once: where the axis of the run is on it."""
-        if self.registration_options or self._searched:
-            return
-        indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"]), self.distance))
-        self._searched = True
-        if indexing is not None and indexing.decided:
-            with suppress(ValueError):  # the axis of the run is not on the map
-                self.registration_options = indexed_start(self.run, indexing)
+    def _start(self, target, call):
+        """Options that say where the run is: given ones, or by an indexing of the measured map, once for its ions."""
+        if self.registration_options:
+            return self.registration_options
+        if (start := self._indexed_start) is None:
+            start = {}
+            indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"]), self.distance))
+            if indexing is not None and indexing.decided:
+                with suppress(ValueError):  # the axis of the run is not on the map
+                    start = indexed_start(self.run, indexing)
+            self._indexed_start = start
+        return start
 
     def set_registration(self, registration: Registration) -> None:
         """Set the transform into the measured frame."""
