@@ -10,6 +10,7 @@ from . import plot as plot
 from . import reconstruction as reconstruction
 from . import simulation as simulation
 from . import specimen as specimen
+from . import spectra as spectra
 from . import studies as studies
 from . import units as units
 from . import warnings as warnings
@@ -18,7 +19,6 @@ from .detection.detector import Detector as Detector
 from .detection.detector_map import DetectorMap as DetectorMap
 from .detection.hits import Hits as Hits
 from .detection.instrument import Instrument as Instrument
-from .detection.mass_spectrum import spectrum as spectrum
 from .emission.energies import TruncatedNormal as TruncatedNormal
 from .emission.perturbations import Combined as Combined
 from .emission.perturbations import LateralVelocity as LateralVelocity
@@ -46,8 +46,9 @@ from .simulation.simulation import Simulation as Simulation
 from .specimen.materials import Material as Material
 from .specimen.materials import material as material
 from .specimen.tip import Tip as Tip
-from .studies.workflows.compare_maps import compare as compare
-from .studies.workflows.simulate_file import simulate as simulate
-from .studies.workflows.twin_of_map import twin as twin
+from .spectra.mass_spectrum import spectrum as spectrum
+from .workflows.compare_maps import compare as compare
+from .workflows.simulate_file import simulate as simulate
+from .workflows.twin_of_map import twin as twin
 
 __version__: str

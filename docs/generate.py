@@ -76,6 +76,7 @@ _GUIDES = {
     "reconstruction": "reconstruction reconstruction_errors",
     "simulation": "flights howto/resume real_units",
     "specimen": "specimens materials howto/own_structure",
+    "spectra": "howto/mass_spectrum",
     "studies": "howto/sweep howto/data_set howto/visibility",
     "units": "conventions",
 }

@@ -14,9 +14,9 @@ from apt_evap._common.validation import check_array, check_choice, check_count, 
 from apt_evap.detection.binning import MAX_BINS, count
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS, field_of_ratio
 from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.spectra.mass_ranges import Ranges
 
 LEAST = 20
 """Fewest ions of both charges for a ratio: 1.5 % of the field where both are equally frequent."""

@@ -18,7 +18,6 @@ from apt_evap.config.lens_text import read_lens
 from apt_evap.config.material_text import read_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_spectrum import spectrum
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.io.distortion_grid import read_grid
 from apt_evap.io.formats import read_ranges
@@ -26,9 +25,10 @@ from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
-from apt_evap.studies.workflows.compare_maps import MAX_STUDY
-from apt_evap.studies.workflows.measured_source import MeasuredSource
-from apt_evap.studies.workflows.twin_of_map import path_word
+from apt_evap.spectra.mass_spectrum import spectrum
+from apt_evap.workflows.compare_maps import MAX_STUDY
+from apt_evap.workflows.measured_source import MeasuredSource
+from apt_evap.workflows.twin_of_map import path_word
 
 
 def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:

@@ -19,7 +19,7 @@ from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.plot.map_figures import binned, default_smoothing, specimen_title
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
-from apt_evap.studies.workflows.maps_of_run import run_maps, settings_of_maps
+from apt_evap.workflows.maps_of_run import run_maps, settings_of_maps
 
 _IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 bins wide
 

@@ -93,8 +93,8 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.fit.fit_settings import FitSettings
     from apt_evap.fit.grid import EnergyGrid
     from apt_evap.plot.report.origin import recorded_warnings
-    from apt_evap.studies.workflows.compare_maps import IN_LINES, compare
-    from apt_evap.studies.workflows.measured_source import MeasuredSource
+    from apt_evap.workflows.compare_maps import IN_LINES, compare
+    from apt_evap.workflows.measured_source import MeasuredSource
 
     def set_by_options(kind):
         return kind(**{name: value for name in declared(kind) if (value := getattr(options, name, None)) is not None})

@@ -34,7 +34,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap import plot
     from apt_evap.cli._files import measured_of
-    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+    from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_indexed.png")
     check_output(picture, is_picture, options.force)

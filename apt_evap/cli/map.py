@@ -99,8 +99,8 @@ def _add_crystal(parser):
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap.cli._maps_of_file import maps_of_file
-    from apt_evap.studies.workflows.maps_of_run import map_summaries
-    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
+    from apt_evap.workflows.maps_of_run import map_summaries
+    from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)

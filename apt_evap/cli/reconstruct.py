@@ -77,7 +77,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.plot.reconstructions import FEWEST
     from apt_evap.reconstruction.origins import OriginTable
     from apt_evap.reconstruction.reconstruct import reconstruct
-    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+    from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
     output = check_path(options.output or f"{Path(options.file).stem}_reconstructed.pos")
     if output.exists() and not options.force:

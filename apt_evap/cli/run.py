@@ -50,7 +50,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap.cli._progress import run_progress
-    from apt_evap.studies.workflows.simulate_file import simulate
+    from apt_evap.workflows.simulate_file import simulate
 
     simulated = simulate(
         options.config,

@@ -45,10 +45,10 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap._common.files import FileError, check_path
     from apt_evap.cli._files import read, select
     from apt_evap.detection.hits import Hits
-    from apt_evap.detection.mass_spectrum import spectrum
     from apt_evap.io.formats import read_ranges
     from apt_evap.io.rrng import write_rrng
-    from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
+    from apt_evap.spectra.mass_spectrum import spectrum
+    from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_spectrum.png")
     check_output(picture, is_picture, options.force)

@@ -43,7 +43,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.cli._files import measured_source
     from apt_evap.cli._progress import run_progress
     from apt_evap.config.material_text import read_material
-    from apt_evap.studies.workflows.twin_of_map import twin
+    from apt_evap.workflows.twin_of_map import twin
 
     twin(
         measured_source(options),

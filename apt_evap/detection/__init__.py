@@ -1,4 +1,4 @@
-"""Detection of the ions: detector, hits, detector maps, mass ranges, projections, the lens of an instrument."""
+"""Detection of the ions: detector, hits, detector maps, projections, the lens of an instrument."""
 
 import lazy_loader
 

@@ -1,7 +1,6 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .hits import Outcome as Outcome
 from .instrument import Detection as Detection
-from .mass_ranges import Ranges as Ranges
 from .microscope.local_electrode import LocalElectrode as LocalElectrode
 from .microscope.run_lens import field_of_view as field_of_view
 from .projection import Projection as Projection

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_spectrum import Spectrum, spectrum
+from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
 
 NUMBERED = "\0"
 """Place in the text that reads a file where the rows are those of the file."""

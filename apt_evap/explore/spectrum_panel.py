@@ -24,11 +24,11 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from apt_evap.detection.mass_spectrum import Spectrum
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
 from apt_evap.explore.search_process import start_thread
 from apt_evap.explore.widgets import LEFT
 from apt_evap.io.rrng import write_rrng
+from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")

@@ -16,7 +16,6 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io._points import is_data
 from apt_evap.io._texts import read_head, without_compression
@@ -36,6 +35,7 @@ from apt_evap.io.tapsim import WRITTEN as TAPSIM_COLUMNS
 from apt_evap.io.tapsim import read_tapsim, write_tapsim
 from apt_evap.io.vtp import write_vtp
 from apt_evap.io.xyz import write_xyz
+from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import DataWarning, warn
 
 __all__ = [

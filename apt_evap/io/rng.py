@@ -8,8 +8,8 @@ import numpy as np
 
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io._texts import atoms_in, colour, count, formula, number, read_text, species_name
+from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import DataWarning, warn
 
 

@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.detection.mass_spectrum import Spectrum
 from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.spectra.mass_ranges import Ranges
+from apt_evap.spectra.mass_spectrum import Spectrum
 
 _MOST_BINS = 1_000_000
 _MARGIN = 0.04  # of the range of masses, on both sides

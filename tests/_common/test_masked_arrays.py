@@ -5,8 +5,8 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.validation import check_array, check_values
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.timing import mass_to_charge
+from apt_evap.spectra.mass_ranges import Ranges
 
 MASKED = np.ma.array([1.0, -999.0, 3.0], mask=[False, True, False])
 MEANT = [1.0, np.nan, 3.0]

@@ -186,7 +186,7 @@ EMISSIONS = {
 }
 hits = ae.Hits(x=[1.0, 2, 3], y=[1.0, 2, 4], mass_to_charge=[58.0, 59.0, 59.0], voltage=[1e3, 1e3, 1e3])
 grid = ae.DetectorMap.from_array(np.ones((20, 20)), np.arange(21), np.arange(21))
-ranges = ae.detection.Ranges(**RANGES)
+ranges = ae.spectra.Ranges(**RANGES)
 ring = ae.maps.radial_profile(hits, outer=9.0)
 strip = ae.maps.Rectangle((0.0, 0.0), 0.0, 20.0, 20.0)
 azimuths = ae.maps.ring_statistics(
@@ -435,7 +435,7 @@ CASES = [
     row(ae.similarity, {"map_a": grid, "map_b": grid}, "data_range", map_b=[hits]),
     row(ae.maps.similarity_ceiling, {"hits": hits}),
     row(
-        ae.detection.Ranges,
+        ae.spectra.Ranges,
         RANGES,
         names=["Ni", [3]],
         low=[[NAN], [1.0, 2.0], [70.0]],

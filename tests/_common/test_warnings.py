@@ -25,7 +25,7 @@ def test_a_warning_names_the_line_of_the_caller(tmp_path, small_tip):
     with pytest.warns(ae.warnings.AptWarning) as caught:
         ae.write(tmp_path / "ions.epos", hits)
         list(ae.io.chunks(tmp_path / "ions.epos", 10))
-        ae.detection.Ranges(("Si", "Ge"), np.array([1.0, 1.5]), np.array([2.0, 3.0]))
+        ae.spectra.Ranges(("Si", "Ge"), np.array([1.0, 1.5]), np.array([2.0, 3.0]))
         ae.Simulation(small_tip, seed=1).run(10**6, progress=lambda ions, all_ions: None)
     kinds = {warning.category for warning in caught}
     assert kinds == {ae.warnings.DataWarning, ae.warnings.RunWarning} and len(caught) > 4

@@ -224,7 +224,7 @@ def test_a_spectrum_with_tails_gives_nearly_the_same_ratio(real):
     """Energy deficits shift ions out of their ranges, by the same fraction of the mass for both charges."""
     units = replace(real.units, timing=ae.detection.Timing(temperature=50.0))
     hits = replace(real, units=units).hits(ae.Unperturbed())
-    ranges = ae.detection.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
+    ranges = ae.spectra.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
     charges = ion_charges(hits, "Ni", ranges)
     assert set(charges) <= {0, 1, 2} and np.mean(charges[hits.detected] == 0) < 0.02
     inside = charges > 0
@@ -251,7 +251,7 @@ def test_every_isotope_has_its_charge(element):
     electrons = list(ISOTOPES).index(element) + 1 if element in ("H", "He") else 4
     for mass, _ in ISOTOPES[element]:
         for charge in range(1, electrons + 1):
-            ranges = ae.detection.Ranges([element], [mass / charge - 0.1], [mass / charge + 0.3])
+            ranges = ae.spectra.Ranges([element], [mass / charge - 0.1], [mass / charge + 0.3])
             assert ion_charges(ae.Hits(mass_to_charge=[mass / charge, 0.3]), element, ranges).tolist() == [charge, 0]
 
 
@@ -259,7 +259,7 @@ def test_only_single_atoms_have_charges():
     names = ["Ni", "Ni+", "Ni ++", "Ni2+", "NiO", "Ni2", "Ni"]
     low = [60.0, 57.9, 28.9, 30.0, 73.9, 115.8, 58.9]
     composition = [{}, {}, {}, {}, {}, {}, {"Ni": 1, "H": 1}]
-    ranges = ae.detection.Ranges(names, low, np.add(low, 0.2), composition=composition)
+    ranges = ae.spectra.Ranges(names, low, np.add(low, 0.2), composition=composition)
     charges = ion_charges(ae.Hits(mass_to_charge=np.add(low, 0.1)), "Ni", ranges)
     assert charges.tolist() == [1, 1, 2, 2, 0, 0, 0]
 
@@ -267,7 +267,7 @@ def test_only_single_atoms_have_charges():
 def test_a_dimer_is_not_an_atom():
     for name in ("Ni", "Ni2+"):
         with pytest.raises(ValueError, match=r"115\.8 to 116 Da is not a range of Ni, whose isotopes have 57\.9"):
-            ion_charges(ae.Hits(mass_to_charge=[116.0]), "Ni", ae.detection.Ranges([name], [115.8], [116.0]))
+            ion_charges(ae.Hits(mass_to_charge=[116.0]), "Ni", ae.spectra.Ranges([name], [115.8], [116.0]))
 
 
 # ---- errors --------------------------------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ def test_a_dimer_is_not_an_atom():
 def test_what_is_refused():
     hits = ions_in(lambda x, y: np.full(len(x), 24.5), "Ni", 1, 1000, 7)
     bare = replace(hits, extra={})
-    ranges = ae.detection.Ranges(["Ni"], [57.0], [60.0])
+    ranges = ae.spectra.Ranges(["Ni"], [57.0], [60.0])
     for ions, element, options, message in (
         (bare, "Ni", {}, "these hits have no charges: pass ranges=read_ranges"),
         (bare, "Fe", {"ranges": ranges}, "ranges have no range of single atoms of Fe, only of Ni"),

@@ -23,7 +23,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Combined, LateralVelocity, RollUp, Unperturbed
 from apt_evap.io.formats import write
 from apt_evap.simulation.run import load
-from apt_evap.studies.workflows import simulate_file
+from apt_evap.workflows import simulate_file
 
 HERE = str(Path(cli.__file__).parents[2])  # the package under test, installed or not
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")

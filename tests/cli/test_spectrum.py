@@ -10,9 +10,9 @@ from apt_evap import plot
 from apt_evap.cli._files import measured_of
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read_ranges
 from apt_evap.io.rrng import write_rrng
+from apt_evap.spectra.mass_ranges import Ranges
 
 N, BELOW = 12_000, 6000
 MASSES = {"Ni": (57.9353, 59.9308), "Al": (26.9815,)}

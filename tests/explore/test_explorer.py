@@ -141,7 +141,7 @@ def test_without_a_measurement_it_is_the_map_of_the_command_line(run, tmp_path, 
     explorer = Explorer(run, run_arguments=["run.h5"])
     drawn = []
     monkeypatch.setattr(
-        "apt_evap.studies.workflows.written_pictures.save_picture",
+        "apt_evap.workflows.written_pictures.save_picture",
         lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
     )
     for settings in (explorer.start, ExplorerSettings(ae.Combined(ENERGY, 0.4), 48, 3.5, ions=(100, 1500))):
@@ -212,7 +212,7 @@ def test_a_rectangle_selects_ions(run, measured, explorer, tmp_path, monkeypatch
     ae.write("MEASURED.epos", measured)
     drawn = []
     monkeypatch.setattr(
-        "apt_evap.studies.workflows.written_pictures.save_picture",
+        "apt_evap.workflows.written_pictures.save_picture",
         lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
     )
     words = shlex.split(selection.shell.replace("MEASURED", "MEASURED.epos"))
@@ -483,7 +483,7 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
         assert executed(explorer.selection(settings, (0.0, 9.0), (0.0, 9.0)).python)["measured"].x.min() >= 0
         drawn = []
         monkeypatch.setattr(
-            "apt_evap.studies.workflows.written_pictures.save_picture",
+            "apt_evap.workflows.written_pictures.save_picture",
             lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
         )
         words = shlex.split(explorer.commands(settings).shell)

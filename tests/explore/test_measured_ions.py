@@ -73,7 +73,7 @@ def test_a_selection_is_the_same_as_text(hits, selection, of_times, tmp_path, mo
     assert chosen.code("ae.read('a.epos')") in command.python
     drawn = []
     monkeypatch.setattr(
-        "apt_evap.studies.workflows.written_pictures.save_picture",
+        "apt_evap.workflows.written_pictures.save_picture",
         lambda path, maps, titles, *_, **__: drawn.append(maps[0]),
     )
     assert main([*shlex.split(command.shell)[1:], "--quiet"]) == 0

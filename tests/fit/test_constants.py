@@ -110,7 +110,7 @@ def test_charge_states_and_a_map_without_ions(measured):
     rng = np.random.default_rng(4)
     mass = np.where(rng.random(len(hits)) < 0.2, 58.0, 29.0)
     charged = ae.Hits(x=hits.x, y=hits.y, voltage=hits.voltage, mass_to_charge=mass)
-    ranges = ae.detection.Ranges(names=("Ni", "Ni"), low=[57.5, 28.7], high=[58.5, 29.3])
+    ranges = ae.spectra.Ranges(names=("Ni", "Ni"), low=[57.5, 28.7], high=[58.5, 29.3])
     checks = ae.fit.constants_of(detector_map, best, charged, ranges=ranges).checks
     ratio, field = checks[-2:]
     assert abs(ratio.z) < 4 and ratio.expected == pytest.approx(np.log(4), abs=4 * ratio.error)

@@ -31,9 +31,9 @@ from ion_files import (
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import FORMATS, RANGE_FORMATS, chunks, read, read_ranges, write
 from apt_evap.io.tapsim import SIGNATURE as TAPSIM
+from apt_evap.spectra.mass_ranges import Ranges
 
 SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"
 CHUNKED = {entry.suffix for entry in FORMATS if entry.chunks}

@@ -6,9 +6,9 @@ from ion_files import ENV, RNG
 
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io import rng
 from apt_evap.io.formats import read_ranges
+from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import DataWarning
 
 

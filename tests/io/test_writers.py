@@ -14,8 +14,8 @@ from hypothesis.extra.numpy import arrays
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read, write
+from apt_evap.spectra.mass_ranges import Ranges
 
 
 def full():

@@ -6,7 +6,7 @@ from matplotlib.image import imread
 
 import apt_evap as ae
 from apt_evap.plot.paper_figures import FONT, add_scale_bar
-from apt_evap.studies.workflows.written_pictures import DPI, save_picture
+from apt_evap.workflows.written_pictures import DPI, save_picture
 
 EDGES = np.linspace(-35, 35, 65)
 

@@ -349,7 +349,7 @@ def test_voltage_curve_of_ions(real):
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), smoothed_history(real.voltages / 1.2, 4).median)
     expected = hits.detected[125:].sum() / hits.pulses[125:].sum()
     assert axes[1].patches[0].get_data().values[-1] == pytest.approx(expected)
-    ranges = ae.detection.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
+    ranges = ae.spectra.Ranges(["Ni", "Ni"], [28.9, 57.8], [32.2, 64.4])
     measured = ae.Hits(voltage=hits.voltage, mass_to_charge=hits.mass_to_charge)
     axes = plot.voltage_curve(measured, element="Ni", ranges=ranges)
     assert labels_of(axes) == ["voltage [V]", "Ni$^{2{+}}$ / Ni$^{{+}}$"]
@@ -363,7 +363,7 @@ def test_voltage_curves_that_cannot_be_drawn(run, real):
     with pytest.raises(ValueError, match="axes"):
         plot.voltage_curve(real, [plot.new_figure((3, 2)).subplots()])
     with pytest.raises(ValueError, match="ranges"):
-        plot.voltage_curve(ae.Hits(voltage=[1.0]), ranges=ae.detection.Ranges(["Ni"], [28.9], [32.2]))
+        plot.voltage_curve(ae.Hits(voltage=[1.0]), ranges=ae.spectra.Ranges(["Ni"], [28.9], [32.2]))
     with pytest.raises(ValueError, match="no column 'voltage'"):
         plot.voltage_curve(ae.Hits(x=[0.0], y=[0.0]))
     with pytest.raises(ValueError, match="run must be a Run or Hits"):
@@ -646,7 +646,7 @@ def test_a_reconstruction_from_two_sides_with_its_profile(rng):
     counted = density.lines[0].get_ydata()
     assert counted.mean() == pytest.approx(expected, rel=4 / np.sqrt(len(ions) / 4))
     assert set(radii.lines[0].get_ydata()) == {30.0}
-    ranges = ae.detection.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
+    ranges = ae.spectra.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
     with pytest.warns(ae.warnings.DataWarning, match="outside every range"):
         side, _, fractions, bars = plot.reconstruction(found, ranges, title="a$b")
     names = [text.get_text() for text in bars.get_yticklabels()]

@@ -142,7 +142,7 @@ class TestPandas:
         assert set(frame) == {*hits.columns, *hits.extra, "position_x", "position_y", "position_z"} - {"positions"}
 
     def test_species_of_measured_ions(self):
-        ranges = ae.detection.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
+        ranges = ae.spectra.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
         frame = ae.Hits(mass_to_charge=[27.0, 63.0, 27.0, 40.0]).to_dataframe(ranges)
         assert frame["species"].tolist() == ["Al", "Cu", "Al", ""]
         with pytest.raises(ValueError, match="ranges"):

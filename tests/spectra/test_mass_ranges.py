@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits, Outcome
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.io.formats import read, read_ranges
+from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import DataWarning
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

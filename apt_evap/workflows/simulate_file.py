@@ -20,9 +20,9 @@ from apt_evap.simulation.run import Run
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.simulation.stop_reason import StopReason
-from apt_evap.studies.workflows.maps_of_run import map_summaries, run_maps
-from apt_evap.studies.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
 from apt_evap.warnings import WorkflowWarning, warn
+from apt_evap.workflows.maps_of_run import map_summaries, run_maps
+from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
 
 _CONTINUE = "the same command with --resume continues (resume=True in Python)"
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_number, short_text
-from apt_evap.detection.flight_fit import FlightFit
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.isotope_comb import (
+from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
+from apt_evap.spectra.flight_fit import FlightFit
+from apt_evap.spectra.isotope_comb import (
     LARGEST_MISFIT,
     Comb,
     LogSpectrum,
@@ -20,8 +21,7 @@ from apt_evap.detection.isotope_comb import (
     in_intervals,
     isotopes_of,
 )
-from apt_evap.detection.mass_ranges import Ranges
-from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
+from apt_evap.spectra.mass_ranges import Ranges
 
 FEWEST_OF_ELEMENT = 4000
 """Ions of an element that are enough for a map."""

@@ -21,7 +21,6 @@ from apt_evap.config.lens_text import read_lens
 from apt_evap.config.material_text import write_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.mass_ranges import Ranges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
 from apt_evap.fit.grid import EnergyGrid
@@ -44,11 +43,12 @@ from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.studies.workflows.compare_maps import IN_LINES, REPORT, compare
-from apt_evap.studies.workflows.kept_files import KeptFiles
-from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
-from apt_evap.studies.workflows.simulate_file import no_note, simulate
+from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import MapWarning, warn
+from apt_evap.workflows.compare_maps import IN_LINES, REPORT, compare
+from apt_evap.workflows.kept_files import KeptFiles
+from apt_evap.workflows.measured_source import MeasuredSource, source_of
+from apt_evap.workflows.simulate_file import no_note, simulate
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",

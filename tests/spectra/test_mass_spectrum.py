@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.detection.isotope_comb import STEP, LogSpectrum, isotopes_of
 from apt_evap.detection.timing import MASS_TO_CHARGE
 from apt_evap.io.formats import read_ranges
+from apt_evap.spectra.isotope_comb import STEP, LogSpectrum, isotopes_of
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 NICKEL = {("Ni", 2): 5, ("Ni", 1): 3}
@@ -205,7 +205,7 @@ def test_saved_ranges_are_read_again(tmp_path):
     assert np.abs(np.sort(again.low) - np.sort(ranges.low)).max() < 1e-4
     assert np.array_equal(again.labels(hits), ranges.labels(hits))
     with pytest.raises(ValueError, match="composition"):
-        ae.io.write_rrng(tmp_path / "b.rrng", ae.detection.Ranges(["?"], [1.0], [2.0]))
+        ae.io.write_rrng(tmp_path / "b.rrng", ae.spectra.Ranges(["?"], [1.0], [2.0]))
     assert not (tmp_path / "b.rrng").exists()
 
 

@@ -15,9 +15,9 @@ import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
-from apt_evap.studies.workflows import kept_files, twin_of_map
-from apt_evap.studies.workflows.kept_files import RECORD, KeptFiles
 from apt_evap.warnings import warn
+from apt_evap.workflows import kept_files, twin_of_map
+from apt_evap.workflows.kept_files import RECORD, KeptFiles
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 

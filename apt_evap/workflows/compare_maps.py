@@ -26,10 +26,10 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
-from apt_evap.studies.workflows.measured_source import MeasuredSource, source_of
-from apt_evap.studies.workflows.simulate_file import Simulated, no_note
-from apt_evap.studies.workflows.written_pictures import check_output
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
+from apt_evap.workflows.measured_source import MeasuredSource, source_of
+from apt_evap.workflows.simulate_file import Simulated, no_note
+from apt_evap.workflows.written_pictures import check_output
 
 STUDY, TABLE, OVERLAY, REPORT = "study.json", "scores.csv", "registration.png", "report.html"
 IN_LINES = (RegistrationWarning, StructureWarning)

@@ -12,8 +12,8 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.plot.report.html_page import read_report
-from apt_evap.studies.workflows import compare_maps, measured_source
 from apt_evap.warnings import WorkflowWarning
+from apt_evap.workflows import compare_maps, measured_source
 
 SMALL = """
 [tip]

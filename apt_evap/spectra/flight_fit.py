@@ -8,7 +8,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.isotope_comb import Comb, LogSpectrum, in_intervals
+from apt_evap.spectra.isotope_comb import Comb, LogSpectrum, in_intervals
 
 _SHAPE = 0.25  # of the width of a peak, by which its unknown shape may shift it
 _DRIFT = 3e-4  # of m/n, by which a measured voltage may shift it

@@ -1,0 +1,5 @@
+"""Mass spectra: ranges, isotopes, the ions that explain the peaks, and the flight length that fits them."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
