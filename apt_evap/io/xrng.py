@@ -29,7 +29,7 @@ class _Node:
     text_line: int = 0
     nodes: "list[_Node]" = field(default_factory=list)
 
-    def child(self, name):
+    def child(self, name: str) -> "_Node | None":
         """First element of this name in it; None if there is none."""
         return next((node for node in self.nodes if node.name == name), None)
 
