@@ -21,8 +21,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "example:\n"
         "  apt-evap run mine.toml -o ni.h5 --ions 5000\n"
         "  apt-evap run precipitate                 a shipped example: copies precipitate.toml to this folder\n"
-        "shipped examples, about a minute each: ni111.toml (a pure tip), precipitate.toml, core_shell.toml,\n"
-        "gamma_prime.toml, gp_zone.toml, multilayer.toml, multilayer_across.toml, grain_boundary.toml"
+        "shipped examples, less than a minute of one processor each: ni111.toml (a pure tip), precipitate.toml,\n"
+        "core_shell.toml, gamma_prime.toml, gp_zone.toml, multilayer.toml, multilayer_across.toml, grain_boundary.toml"
     )
     parser.add_argument("config", metavar="CONFIG.toml", help="settings file, or the name of a shipped example")
     parser.add_argument("-o", "--output", metavar="RUN.h5", help="default: output in the file, or its name with .h5")
