@@ -32,8 +32,8 @@ SHOWN = {  # elements in colour, by example; the others are grey
 }
 EARLY = ("evaporation_field = 23.0", "evaporation_field = 15.0")  # V/nm
 TITLES = {
-    "precipitate": "precipitate that leaves late",
-    "early": "precipitate that leaves early",
+    "precipitate": "late precipitate",
+    "early": "early precipitate",
     "grain_boundary": "grain boundary",
 }
 HALF = 0.5  # nm, of a slice

@@ -148,7 +148,7 @@ class _ChosenFirst:
 
     atoms: Integers
 
-    def keys(self, tip, atoms, fields, bonds):
+    def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
         """Keys of `Extremal`, multiplied by a million for the chosen atoms."""
         return Extremal().keys(tip, atoms, fields, bonds) * np.where(np.isin(atoms, self.atoms), 1e6, 1.0)
 
