@@ -46,7 +46,7 @@ ABOVE_SURROGATES = 3.0
 RIVAL = 20.0
 """Evidence of another crystal structure over the own one above which the map is undecided; if it is less, and more than
 -RIVAL, the map decides for the structure that was given, and the reason says so."""
-EXCLUDED = 30.0
+EXCLUDED = 45.0
 """Evidence below the own one, on the grid of the search, at which another crystal structure is not refined."""
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
@@ -61,7 +61,7 @@ SHOWN = 3
 """Largest number of candidates of an undecided map in texts and pictures."""
 _STARTS, _TO_THE_END = 8, 5  # orientations by each criterion that are refined quickly, and to the end
 _FEW_STARTS, _FEW_TO_THE_END = 3, 2  # of another crystal structure at first
-_HOPELESS = 50.0  # evidence below the own one of these few, at which no more are refined
+_HOPELESS = 80.0  # evidence below the own one of these few, at which no more are refined; more starts gain up to 68
 _TYPICAL = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}  # crystals of the patterns
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
@@ -210,7 +210,8 @@ class Indexing:
         -------
         dict
             verdict, reason, of each candidate its axis, rotation, scale, centre, barrel, rim_change, score,
-            confidence, rolled, contrast, angle_error and the radius of the pattern, and the sentences of `deciding_marks`.
+            confidence, rolled, contrast, angle_error and the radius of the pattern, and the sentences of
+            `deciding_marks`.
         """
         return {
             "verdict": self.verdict,
@@ -285,26 +286,32 @@ def index(
     Raises
     ------
     ValueError
-        If there is no pattern of the structure, an argument is outside its range, a mark is outside the map, or the map
-        has too few bins.
+        If there is no pattern of the structure, an argument is outside its range, or a mark is outside the map.
 
     Notes
     -----
-    A search over all axes, rotations and scales compares the map with a master pattern: the density of hits in every
-    direction of the crystal, simulated, for ions that roll up and for ions that do not. A second search compares local
-    contrast with the patterns, with zone lines that may be bright or dark, and with dark poles: what a person sees. The
-    results of both are refined by two criteria. One is the likelihood of the counts, with free amplitudes of the
-    patterns of all radii and a slow change of the efficiency: twice its logarithm, divided by the variance of the sums
-    of neighbouring residuals of the best model in units of Poisson's, so that a model that leaves structure unexplained
-    decides less. The other one is twice the logarithm of the marginal likelihood of the local contrast. Their sum is
-    the weight of a result.
+    The map is divided by the trimmed mean of every ring about its centre. A search over all axes, rotations and scales
+    compares its counts with master patterns, the simulated densities of hits in every direction of the crystal, for
+    ions that roll up and for ions that do not; and its local contrast with the patterns, with zone lines that may be
+    bright or dark, and with dark poles: what a person sees. The best results are refined by two criteria. One is the
+    likelihood of the counts, with free amplitudes of the patterns of all radii and a slow change of the efficiency:
+    twice its logarithm, divided by the variance of the sums of neighbouring residuals of the best model in units of
+    Poisson's, so that a model that leaves structure unexplained decides less. The other one is twice the logarithm of
+    the marginal likelihood of the local contrast. Their sum is the evidence of a result.
 
-    The map is `decided` if the margin of the first weight to that of the next different result is above 20. Results are
-    different if they give crystal directions to the places of the map that are more than 6 degrees apart (RMS): other
-    orientations, or the same one at another scale. Without marks of a user the map also needs 4,000 ions, and no other
-    crystal structure may have a larger weight. A map of noise has a score of 0. Marks that no orientation explains, or
-    that contradict the map, are named in the reason, and the map is not decided. `Indexing.deciding_marks` says which
-    mark would decide.
+    The map is `decided` if the first result passes four checks. (1) Its evidence is more than 20 above that of the next
+    different result. Results are different if they give crystal directions to the places of the map that are more than
+    6 degrees apart (RMS): other orientations, or the same one at another scale. (2) No half of the map has another
+    orientation with 12 more than the first result, and than no crystal: it may be a second lattice. (3) The map is more
+    than 3 standard deviations above the mean of its surrogates, and above all of them: maps with the same rings and
+    lines at random azimuths. (4) No other crystal structure, searched as hard, has 20 more; one that is within 20 is
+    named, as the result holds only if the specimen is what you say. The map also needs 4,000 ions. With marks of a user
+    only the first check applies. The reason says which check refused, and what would help.
+
+    A map of noise has a score of 0. A map that can show no orientation, such as one without hits, is undecided and has
+    no candidates. Marks that no orientation explains, or that contradict the map, are named in the reason, and the map
+    is not decided. `Indexing.deciding_marks` says which mark would decide. The scale of a candidate is that at the
+    centre; a lens changes it to the rim, and both are printed.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.

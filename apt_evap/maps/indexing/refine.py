@@ -79,7 +79,7 @@ class Refined:
     scale: float
     """[mm/rad], from the centre to the rim of the disc."""
     stretch: float
-    """Radial stretch b at the rim, positive for a barrel: r = scale_at_centre t (1 - b (t scale / radius)^2), t [rad]."""
+    """Radial stretch b at the rim, positive for a barrel: r = scale_at_centre t (1 - b (t / t_rim)^2), angle t."""
     amplitudes: np.ndarray
     """Of the densities, shape (k,)."""
     gain: float
