@@ -15,7 +15,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "stored in RUN.h5.unfinished. After a crash --resume continues from there, with the same bits as an\n"
         "uninterrupted run. The progress bar shows: charges (RMS residual relative to the mean charge); fractions\n"
         "of the last ions that missed, never left the tip, or are flagged (inexact responses). Without a terminal:\n"
-        "one line per minute."
+        "one line per minute. Classes of your own that the file names (module:Class) are imported and executed."
     )
     parser.epilog = (
         "example:\n"
@@ -62,6 +62,7 @@ def execute(options: argparse.Namespace) -> int:
         resume=options.resume,
         overwrite=options.force,
         checkpoint=options.checkpoint,
+        own_classes=True,
         progress=run_progress(options.quiet),
         note=partial(tell, options),
     )
