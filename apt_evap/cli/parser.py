@@ -51,7 +51,7 @@ COMMANDS = {
     "map": "draw detector maps of a run or of measured ions",
     "info": "summarise a file",
     "spectrum": "draw and name the peaks of the mass spectrum of measured ions",
-    "composition": "at.% of measured ions, with errors, and what is unexplained",
+    "composition": "composition of measured ions with its errors, and what is unexplained",
     "index": "which crystal direction is where on a measured map",
     "start": "settings file for a simulation of a measured specimen",
     "twin": "from a measured file to a simulation of its specimen, a fit and a report",

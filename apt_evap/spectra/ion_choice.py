@@ -1,6 +1,6 @@
 """Choice of the ions of a spectrum: evidence of all peaks against a cost of every ion and element."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -250,7 +250,9 @@ class IonChoice:
                 (value, chosen, amplitudes), changed = best, True
         return chosen, amplitudes, value, changed
 
-    def replacements(self, chosen: Sequence[int], number: int, tried: Rows, limit: float):  # type: ignore[no-untyped-def]
+    def replacements(
+        self, chosen: Sequence[int], number: int, tried: Rows, limit: float
+    ) -> Iterator[tuple[float, int, Floats, list[int]]]:
         """Ions that could be in place of one, whose chi-squared and costs are perhaps below a limit."""
         fit = self.fit
         rest = [other for other in chosen if other != number]

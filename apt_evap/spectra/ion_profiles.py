@@ -8,6 +8,7 @@ from apt_evap._common.types import Floats
 from apt_evap.spectra.peak_contents import Contents, PeakContents
 
 _OWN = 0.5  # part of a peak that an ion has, for a range there
+_FOOT = 0.003  # of the height of a peak, below which no range goes, whatever the background
 _CLEAR = 3.0  # errors of counting by which such a part is above zero
 _FEWEST = 5.0  # ions of such a part
 _ITERATIONS, _PRECISION = 300, 1e-5  # of the likelihood fit, and relative change at which it ends
@@ -80,8 +81,9 @@ class IonProfiles:
                 top = int(np.clip(np.rint(scale.bins(contents.mass[peak])), 0, scale.size - 1))
                 if not above[top]:
                     continue
-                low = top - _run(above[top::-1])
-                high = top + _run(above[top:])
+                inside = above & (density > _FOOT * density[top])
+                low = top - _run(inside[top::-1])
+                high = top + _run(inside[top:])
                 if bounds and low <= bounds[-1][1] + 1:
                     bounds[-1][1] = max(high, bounds[-1][1])
                 else:

@@ -93,10 +93,21 @@ class UnexplainedPeak:
 class Spectrum:
     """Mass spectrum of ions; made by `spectrum`.
 
-    Attributes
+    Parameters
     ----------
     hits : Hits
         The ions, with mass_to_charge [Da].
+    peaks : PeakContents
+        Their peaks.
+    source : object
+        What explains the peaks: the ions of elements, or those of ranges.
+    flight : FlightFit or None
+        Time zero and flight length of m/n; None if the ions had m/n before.
+    refused : str
+        Why a requested element has no peaks; "" if all have.
+
+    Attributes
+    ----------
     ions : tuple of SpectrumIon
         Ions with a name, the most frequent first.
     unexplained : tuple of UnexplainedPeak
@@ -107,10 +118,6 @@ class Spectrum:
         Of ranges that a file gives: those that their ions do not explain, the largest first.
     calibration : MassCalibration
         Relative error of m/n, with its own uncertainty.
-    flight : FlightFit or None
-        Time zero and flight length of m/n; None if the ions had m/n before.
-    refused : str
-        Why a requested element has no peaks; "" if all have.
     """
 
     def __init__(

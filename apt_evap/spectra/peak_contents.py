@@ -1,7 +1,7 @@
 """Numbers of ions in the peaks of a spectrum: all peaks and the background at once, by their likelihood."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -119,7 +119,7 @@ class PeakContents:
         shares = of_kind / np.maximum(of_kind.sum(1, keepdims=True), 1e-9)
         return ions, shares, self._smooth_background @ amplitudes[len(owner) :]
 
-    def columns(self, place: Floats, shapes: Floats):  # type: ignore[no-untyped-def]
+    def columns(self, place: Floats, shapes: Floats) -> Any:
         """Sparse matrix of shapes of peaks at places [bins], shape (size, n)."""
         from scipy.sparse import csc_matrix
 

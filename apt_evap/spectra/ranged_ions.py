@@ -142,11 +142,11 @@ class RangedIons:
         misplaced = elsewhere > np.maximum(_ELSEWHERE * net, _FEWEST)
         expected = np.where(misplaced, np.minimum(expected, net - elsewhere), expected)
         named = np.flatnonzero(wrong | misplaced)
+        low, high, names = self.ranges.low.tolist(), self.ranges.high.tolist(), self.ranges.names
         misfits = [
-            RangeMisfit(self.ranges.names[row], *(float(v[row]) for v in (self.ranges.low, self.ranges.high)),
-                        float(net[row]), max(float(expected[row]), 0.0))
-            for row in named
-        ]  # fmt: skip
+            RangeMisfit(names[row], low[row], high[row], float(net[row]), max(float(expected[row]), 0.0))
+            for row in named.tolist()
+        ]
         part = float(np.abs(net - expected)[named].sum() / max(float(np.maximum(net, 0).sum()), 1.0))
         return sorted(misfits, key=lambda misfit: -abs(misfit.ions - misfit.expected)), part
 
