@@ -25,6 +25,7 @@ from apt_evap.detection.microscope.run_lens import RunLens
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import Perturbation, Unperturbed, perturbation_text
 from apt_evap.evaporation.state import EmitterState
+from apt_evap.measures.point_cloud import PointCloud
 from apt_evap.simulation.columns import Clock, Column, every_column_of, fingerprint_of
 from apt_evap.simulation.flight.response import ResponseModel, Responses, ResponseSettings
 from apt_evap.simulation.history import CapHistory, History
@@ -305,6 +306,23 @@ class Run:
             If the perturbation was not flown and cannot be evaluated from the responses.
         """
         return self.observation.hits(perturbation, by_response)
+
+    def sites(self) -> PointCloud:
+        """True sites of the ions in the specimen, with z out of it, and their elements: for measures of the truth.
+
+        Returns
+        -------
+        PointCloud
+
+        Examples
+        --------
+        >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), solutes={"Al": 0.1}, seed=1)
+        >>> ae.Simulation(tip, seed=1).run(100).sites()
+        <PointCloud: 100 ions from 'sites of the run', 3.1 x 3.2 x 0.4 nm; Ni 86, Al 14>
+        """
+        names = tuple(dict.fromkeys(self.elements))  # phases may share an element
+        number = np.array([names.index(element) for element in self.elements])
+        return PointCloud(self.emissions.positions, number[self.species], names, source="sites of the run")
 
     def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits alone, the same as those of `hits`.

@@ -323,13 +323,13 @@ CASES = [
     row(ae.Instrument().hits, {"hits": ae.Hits(**HITS, time_of_flight=[1.0, 2.0], pulse_id=[0, 1])}, "distance"),
     row(ae.Extremal, bonds=[ae.evaporation.PairEnergies]),
     row(
-        ae.reconstruction.interface_profile,
+        ae.measures.interface_profile,
         {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
         "reach bin_width",
         distances=[[NAN, 1.0, 2.0, 3.0]],
     ),
     row(
-        ae.reconstruction.segregation_profile,
+        ae.measures.segregation_profile,
         {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
         "reach bin_width",
         distances=[[NAN, 1.0, 2.0, 3.0]],
