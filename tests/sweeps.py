@@ -57,9 +57,9 @@ def command(sweep, *options, **environment):
 
 
 def poison(sweep, key):
-    """Give a point settings that its run refuses."""
-    path = sweep.folder_of(key) / "settings.toml"
-    path.write_text(path.read_text().replace('material = "Ni"', 'material = "Unobtainium"'))
+    """Give a point settings that its run refuses; its key is that of the plan, of which the maps are no part."""
+    with open(sweep.folder_of(key) / "settings.toml", "a") as file:
+        file.write('\n[[maps.panels]]\nperturbation = "Unobtainium"\n')
 
 
 def write_dump(path, radius=1.1):

@@ -27,7 +27,7 @@ def read_cloud(options: argparse.Namespace, what: str) -> tuple[Any, list[str], 
     """Point cloud of the file, its solutes, and the path of the picture."""
     from apt_evap.detection.hits import Hits
     from apt_evap.io.formats import read_ranges
-    from apt_evap.measures.point_cloud import point_cloud
+    from apt_evap.measures.point_cloud import PointCloud
     from apt_evap.simulation.read_file import read
     from apt_evap.simulation.run import Run
     from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path
@@ -44,4 +44,4 @@ def read_cloud(options: argparse.Namespace, what: str) -> tuple[Any, list[str], 
     if options.ranges is None and "element" not in content.extra:
         raise ValueError(f"--ranges is missing: the species of the ions of {options.file!r} are not known")
     ranges = None if options.ranges is None else read_ranges(options.ranges)
-    return point_cloud(content, ranges), options.solute.split(","), picture
+    return PointCloud.of(content, ranges), options.solute.split(","), picture

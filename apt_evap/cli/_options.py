@@ -35,17 +35,17 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     )
     selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
     selection.add_argument("--box", type=_box, metavar="X0,X1,Y0,Y1", help="rectangle on the detector [mm]")
-    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
+    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env, .xrng: ranges of mass, for --species")
     selection.add_argument(
         "--species", metavar="NAME[,NAME]", help="ions of these names, such as Si: in --ranges, or of a run"
     )
     return group
 
 
-def add_indexing(parser: argparse.ArgumentParser) -> None:
+def add_indexing(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Add options of the crystal on a measured map."""
     group = parser.add_argument_group("crystal")
-    group.add_argument("--element", metavar="NAME", required=True, help=f"the crystal: {MATERIAL_HELP}")
+    group.add_argument("--element", metavar="NAME", required=required, help=f"the crystal: {MATERIAL_HELP}")
     add_flight(group)
     group.add_argument(
         "--all-ions",

@@ -22,7 +22,7 @@ from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import field_of_view
-from apt_evap.emission.perturbations import Perturbation
+from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
@@ -132,6 +132,14 @@ class Config:
         if self.output is not None and not (isinstance(self.output, str) and self.output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
+        if self.real_units is not None and not self.responses:
+            for (
+                perturbation
+            ) in self.emissions:  # its energies are those of an experiment, its flight would be at 1000 V
+                if perturbation != Unperturbed():
+                    raise ValueError(
+                        f"[simulation] responses must be true for maps of {short_text(perturbation)} in real units"
+                    )
         check_law(self.law)
         check_rule(self.rule)
 
@@ -237,7 +245,7 @@ class Config:
             return run.at_evaporation_field(self.microscope, self.real_units)
 
 
-def read_config(path: str | Path) -> Config:
+def read_config(path: str | Path, *, own_classes: bool = False) -> Config:
     """Read a simulation from a TOML file.
 
     The tables are ``[tip]`` (the arguments of `Tip`; lengths in nm or, as text, in lattice constants: "20 a"; or a
@@ -249,13 +257,17 @@ def read_config(path: str | Path) -> Config:
     fields of that class), ``[control]`` (`VoltageControl`), ``[real_units]`` (fields of `OperatingPoint`),
     ``[microscope]`` (fields of `LocalElectrode`, or a ``preset``)
     and ``[maps]`` (fields of `MapSettings`). A law, a rule, bonds, a perturbation, a distribution of energies or a
-    region may also be of a class of one's own, by the name ``"module:Class"`` (:doc:`/extending`). Only ``[tip]`` with
-    a material and an apex_radius, or with a file, and the ions in ``[simulation]``, are required.
+    region may also be of a class of one's own, by the name ``"module:Class"``, if they are turned on
+    (:doc:`/extending`). Only ``[tip]`` with a material and an apex_radius, or with a file, and the ions in
+    ``[simulation]``, are required.
 
     Parameters
     ----------
     path : str or path-like
         The file.
+    own_classes : bool
+        Whether modules with classes of one's own are imported, which executes them. Off by default: turn it on only for
+        a file that you trust.
 
     Returns
     -------
@@ -266,7 +278,7 @@ def read_config(path: str | Path) -> Config:
     FileError
         If the file cannot be read or is not TOML, or a table, key or value is wrong; the message names it.
     """
-    return config_of(read_document(path), Path(path), own_classes=True)
+    return config_of(read_document(path), Path(path), own_classes=own_classes)
 
 
 def read_document(path: str | Path) -> dict[str, Any]:
@@ -305,7 +317,7 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
     path : Path
         Name of the file, for messages.
     own_classes : bool
-        Whether the user has given this file, so that modules with classes of the user's own are imported.
+        Whether modules with classes of one's own are imported, as in `read_config`.
 
     Returns
     -------
@@ -317,7 +329,7 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
         If a table, key or value is wrong; the message names it.
     """
     with _located(path):
-        _check_tables(document)
+        check_switch(own_classes, "own_classes")
         key = key_of(document)
         document = with_own_objects(document, path.parent if own_classes else None)
     # the specimen
@@ -409,8 +421,9 @@ def key_of(document: Mapping[str, Any]) -> str:
     Raises
     ------
     ValueError
-        If a value is not of the types of JSON, such as a date.
+        If a table is missing or unknown, or a value is not of the types of JSON, such as a date.
     """
+    _check_tables(document)
     document = {name: value for name, value in document.items() if name != "output"}
     if document["simulation"].get("responses", True):
         document.pop("maps", None)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -13,10 +13,8 @@ from apt_evap._core.control import SteadyRate
 from apt_evap._core.elementary import exponential, logarithm
 from apt_evap._core.law import LawKernel
 from apt_evap.detection.hits import Hits
+from apt_evap.specimen.tip import Tip
 from apt_evap.units import BOLTZMANN
-
-if TYPE_CHECKING:
-    from apt_evap.specimen.tip import Tip
 
 _STEP = 1e-6  # relative, for the slope of the rate: 1e-3 of what changes the rate by a factor of e at 20 K
 _LARGEST_STEP = 0.05  # relative change of the voltage in one step of Newton's method
@@ -153,7 +151,7 @@ class ThermalLaw(Protocol):
         """Control of the voltage if none is given."""
         ...
 
-    def sensitivities(self, tip: "Tip") -> Floats:
+    def sensitivities(self, tip: Tip) -> Floats:
         """Sensitivity C of each species [eV], shape (n_species,)."""
         ...
 
@@ -161,7 +159,7 @@ class ThermalLaw(Protocol):
         """Barrier over kT at the wanted rate, and the time at the top of a pulse [s], 0 without pulses."""
         ...
 
-    def kernel(self, tip: "Tip", control: VoltageControl | None = None) -> LawKernel:
+    def kernel(self, tip: Tip, control: VoltageControl | None = None) -> LawKernel:
         """Return the compiled law for a specimen, whose keys are logarithms of rates."""
         ...
 
@@ -186,7 +184,7 @@ class RateControl(SteadyRate):
         self._slope = math.nan  # dlnV/dlnK at the last relaxation
 
     @classmethod
-    def of(cls, law: ThermalLaw, tip: "Tip", control: VoltageControl | None) -> "RateControl":
+    def of(cls, law: ThermalLaw, tip: Tip, control: VoltageControl | None) -> "RateControl":
         """Return the control for a law on a specimen; by default the usual one of the law."""
         control = law.default_control() if control is None else control
         sensitivity = float(law.sensitivities(tip)[0])

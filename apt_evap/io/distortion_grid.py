@@ -33,7 +33,10 @@ def read_grid(path: AnyPath) -> DistortionGrid:
         form a grid.
     """
     text = read_text(path, "a calibration grid", _MAX_BYTES)
-    rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
+    try:
+        rows = [row for row in csv.reader(io.StringIO(text, newline="")) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise FileError(f"{str(path)!r} is not a calibration grid: {error}") from error
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     missing = [name for name in _COLUMNS if name.lower() not in header]
     if missing:

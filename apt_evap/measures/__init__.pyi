@@ -11,6 +11,5 @@ from .interface import segregation_profile as segregation_profile
 from .order import radial_distribution as radial_distribution
 from .order import short_range_order as short_range_order
 from .point_cloud import PointCloud as PointCloud
-from .point_cloud import point_cloud as point_cloud
 from .triangle_mesh import ConvexHull as ConvexHull
 from .triangle_mesh import TriangleMesh as TriangleMesh

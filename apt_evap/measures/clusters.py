@@ -28,7 +28,7 @@ class ClusterSettings:
     Examples
     --------
     >>> ae.measures.ClusterSettings(d_max=0.5, n_min=20, envelope=0.5, erosion=0.5)
-    ClusterSettings(d_max=0.5, n_min=20, envelope=0.5, erosion=0.5)
+    ClusterSettings(d_max=0.5, n_min=20, order=1, envelope=0.5, erosion=0.5)
     """
 
     d_max: float = number("Solutes within this distance belong together.", above=0, unit="nm")
@@ -244,7 +244,7 @@ def choose_separation(
     >>> solute = np.r_[rng.random(5000) < 0.02, np.ones(60, bool)]
     >>> choice = ae.measures.choose_separation(np.r_[matrix, particle], solute)
     >>> print(f"d_max {choice.d_max:.2f} nm, N_min {choice.n_min}, p = {choice.p_value:.2f}")
-    d_max 0.50 nm, N_min 6, p = 0.05
+    d_max 0.53 nm, N_min 4, p = 0.05
     """
     places, solutes = _checked(positions, solute)
     n = int(np.count_nonzero(solutes))

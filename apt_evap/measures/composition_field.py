@@ -91,9 +91,9 @@ class CompositionField:
         >>> rng = np.random.default_rng(1)
         >>> cloud = 6 * rng.random((20_000, 3)) - 3
         >>> in_ball = np.linalg.norm(cloud, axis=1) < 1.5
-        >>> surface = ae.measures.CompositionField.of(cloud, in_ball).isosurface(0.5)
+        >>> surface = ae.measures.CompositionField.of(cloud, in_ball, 0.25, 0.2).isosurface(0.5)
         >>> print(f"{surface.area:.0f} nm^2 of {4 * np.pi * 1.5**2:.0f}")
-        25 nm^2 of 28
+        28 nm^2 of 28
         """
         places = check_array(positions, "positions", ("n", 3))
         numbers = check_array(np.asarray(solute), "solute", (len(places),), dtype=np.float64)

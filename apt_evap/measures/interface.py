@@ -331,7 +331,7 @@ def interfacial_excess(
     >>> chosen = rng.random(40_000) < 0.02 + 0.2 * np.exp(-0.5 * (distances / 0.3) ** 2)
     >>> excess = ae.measures.interfacial_excess(distances, chosen, area=100.0)
     >>> print(f"{excess.value:.1f} +/- {excess.error:.1f} of {0.2 * 0.3 * np.sqrt(2 * np.pi) * 50:.1f} atoms / nm^2")
-    7.6 +/- 0.3 of 7.5 atoms / nm^2
+    7.1 +/- 0.3 of 7.5 atoms / nm^2
     """
     window = check_number(window, "window", above=0, unit="nm")
     reach = check_number(reach, "reach", above=window, unit="nm")

@@ -93,6 +93,52 @@ class PointCloud:
         source = f" from {self.source!r}" if self.source else ""
         return f"<PointCloud: {len(self):,} ions{source}, {extents} nm; {', '.join(parts)}>"
 
+    @classmethod
+    def of(cls, ions: Any, ranges: Any = None, positions: ArrayLike | None = None) -> PointCloud:
+        """Point cloud of ions with positions.
+
+        Parameters
+        ----------
+        ions : Hits
+            Ions with positions, such as those of a .pos file. Ions without a finite position are left out.
+        ranges : Ranges, optional
+            Ranges of mass of measured ions. By default the elements of simulated ions; without any, one species "ion".
+        positions : array_like, optional
+            Other positions [nm], shape (n, 3), such as those of a reconstruction.
+
+        Returns
+        -------
+        PointCloud
+
+        Raises
+        ------
+        ValueError
+            If there are no positions.
+
+        Examples
+        --------
+        >>> ions = ae.Hits(positions=[[0.0, 0, 0], [0, 0, 1]], mass_to_charge=[63.0, 27.0])
+        >>> ranges = ae.spectra.Ranges(["Cu", "Al"], [62.5, 26.5], [63.5, 27.5])
+        >>> ae.measures.PointCloud.of(ions, ranges)
+        <PointCloud: 2 ions, 0.0 x 0.0 x 1.0 nm; Cu 1, Al 1>
+        """
+        check_kind(ions, "ions", "require", "Hits, such as read(path)")
+        places = ions.require("positions")[0] if positions is None else positions
+        places = check_array(places, "positions", (len(ions), 3), finite=False)
+        composition = None
+        if ranges is not None:
+            check_kind(ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
+            names, species = ranges.species_names, ranges.species(ions)
+            first = {name: atoms for name, atoms in zip(ranges.names[::-1], ranges.composition[::-1], strict=True)}
+            composition = tuple(first[name] or {name: 1} for name in names)
+        elif "element" in ions.extra:
+            names, species = np.unique(ions.extra["element"].astype(str), return_inverse=True)
+            names, species = tuple(names.tolist()), species.ravel()
+        else:
+            names, species = ("ion",), np.zeros(len(ions), np.int64)
+        finite = np.isfinite(places).all(axis=1)
+        return cls(places[finite], species[finite], names, composition, ions.source)
+
     # ---- selection and composition ---------------------------------------------------------------------------------
 
     def select(self, where: Any) -> PointCloud:
@@ -237,8 +283,10 @@ class PointCloud:
                 "search for them in spite of it",
                 DataWarning,
             )
-            return Clusters(self, marked, *np.full((2, len(self)), -1), options, choice)
-        return Clusters(self, marked, *label_clusters(self.positions, marked, options), options, choice)
+            none = np.full(len(self), -1)
+            return Clusters(self, marked, none, none, options, choice)
+        of_solutes, of_ions = label_clusters(self.positions, marked, options)
+        return Clusters(self, marked, of_solutes, of_ions, options, choice)
 
     def nearest_neighbours(self, solute: str | Sequence[str], order: int = 1, **options: Any) -> NeighbourDistances:
         """Distances of the k-th nearest solutes of solutes, see `measures.nearest_neighbours`."""
@@ -557,52 +605,6 @@ class Clusters:
             return np.column_stack(
                 [np.bincount(self.members[rows], part[rows], len(self)) / self.solutes for part in values.T]
             )
-
-
-def point_cloud(ions: Any, ranges: Any = None, positions: ArrayLike | None = None) -> PointCloud:
-    """Point cloud of ions with positions.
-
-    Parameters
-    ----------
-    ions : Hits
-        Ions with positions, such as those of a .pos file. Ions without a finite position are left out.
-    ranges : Ranges, optional
-        Ranges of mass of measured ions. By default the elements of simulated ions; without any, one species "ion".
-    positions : array_like, optional
-        Other positions [nm], shape (n, 3), such as those of a reconstruction.
-
-    Returns
-    -------
-    PointCloud
-
-    Raises
-    ------
-    ValueError
-        If there are no positions.
-
-    Examples
-    --------
-    >>> ions = ae.Hits(positions=[[0.0, 0, 0], [0, 0, 1]], mass_to_charge=[63.0, 27.0])
-    >>> ranges = ae.spectra.Ranges(["Cu", "Al"], [62.5, 26.5], [63.5, 27.5])
-    >>> ae.measures.point_cloud(ions, ranges)
-    <PointCloud: 2 ions, 0.0 x 0.0 x 1.0 nm; Cu 1, Al 1>
-    """
-    check_kind(ions, "ions", "require", "Hits, such as read(path)")
-    places = ions.require("positions")[0] if positions is None else positions
-    places = check_array(places, "positions", (len(ions), 3), finite=False)
-    composition = None
-    if ranges is not None:
-        check_kind(ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
-        names, species = ranges.species_names, ranges.species(ions)
-        first = {name: atoms for name, atoms in zip(ranges.names[::-1], ranges.composition[::-1], strict=True)}
-        composition = tuple(first[name] or {name: 1} for name in names)
-    elif "element" in ions.extra:
-        names, species = np.unique(ions.extra["element"].astype(str), return_inverse=True)
-        names, species = tuple(names.tolist()), species.ravel()
-    else:
-        names, species = ("ion",), np.zeros(len(ions), np.int64)
-    finite = np.isfinite(places).all(axis=1)
-    return PointCloud(places[finite], species[finite], names, composition, ions.source)
 
 
 def _fractions(atoms: Floats) -> list[Estimated]:

@@ -19,7 +19,7 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.detection.hits import Hits
 from apt_evap.measures.interface import CompositionProfile
-from apt_evap.measures.point_cloud import Clusters, PointCloud, point_cloud
+from apt_evap.measures.point_cloud import Clusters, PointCloud
 from apt_evap.reconstruction.cap_geometry import CapGeometry, depths_below_apex, polar_angles, voltages_of
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
@@ -134,7 +134,7 @@ class Reconstruction:
         -------
         PointCloud
         """
-        return point_cloud(self.to_hits(frame), ranges)
+        return PointCloud.of(self.to_hits(frame), ranges)
 
     def clusters(self, *arguments: Any, ranges: Any = None, **options: Any) -> Clusters:
         """Clusters of a solute, see `measures.PointCloud.clusters`; ranges as for `cloud`."""

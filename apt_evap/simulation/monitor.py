@@ -1,7 +1,7 @@
 """The monitor of a run: convergence of the charges, and fractions of ions with problems."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +10,8 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.hits import Outcome
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.simulation.history import History
+from apt_evap.simulation.run import Run
 from apt_evap.warnings import ChargesWarning, ResponseWarning, RunWarning, warn
-
-if TYPE_CHECKING:
-    from apt_evap.simulation.run import Run
 
 
 @settings
@@ -81,7 +79,7 @@ class MonitorState:
         Existing parts of the run.
     """
 
-    def __init__(self, settings: Monitor, interval: int, first: int = 0, previous: "Sequence[Run]" = ()) -> None:
+    def __init__(self, settings: Monitor, interval: int, first: int = 0, previous: Sequence[Run] = ()) -> None:
         self._settings, self._interval = settings, interval
         self._rows = []  # complete checks that have not been taken yet
         self._open = None  # ions, RMS and largest residual of a check whose ions are not all counted
@@ -113,7 +111,7 @@ class MonitorState:
             )
         self._close()
 
-    def count(self, part: "Run") -> None:
+    def count(self, part: Run) -> None:
         """Count the ions of the next part of the run."""
         if len(part):
             new = part.emissions.ions >= self._last if self._open is None else slice(None)

@@ -7,7 +7,7 @@ A run is the table of what evaporated. Its observation has the voltages (`Simula
 import math
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,12 +28,11 @@ from apt_evap.emission.perturbations import Perturbation, Unperturbed, described
 from apt_evap.simulation.columns import Flown
 from apt_evap.simulation.flight.field_of_view import stereographic_rim
 from apt_evap.simulation.operating_voltage import RealVoltage, SimulatedVoltage
+from apt_evap.simulation.run_table import RunTable
 from apt_evap.warnings import RunWarning, warn
 
-if TYPE_CHECKING:
-    from apt_evap.simulation.run import Run
-
 _RIM_SAMPLES = 16  # ions, and azimuths, for which the rim of the field of view is followed to a detector
+_Table = TypeVar("_Table", bound=RunTable)  # or a run
 _UNITS = {"charge": "e", "field": "V/nm", "charge_state": "e"}
 
 
@@ -42,11 +41,11 @@ class Observation:
 
     Parameters
     ----------
-    run : Run
-        The run.
+    run : RunTable
+        The table of the run.
     """
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: RunTable) -> None:
         self.run = run
         self.detector = run.detector
         self.operating: SimulatedVoltage | RealVoltage = SimulatedVoltage(run)
@@ -204,7 +203,7 @@ class Observation:
         # errors of the times of an instrument replace those of the run
         units = units if instrument.timing is None else replace(units, timing=None)
         plane = replace(run, units=units, detector=replace(self.detector, projection="plane"))
-        hits = plane.hits(perturbation)
+        hits = Observation(plane).hits(perturbation)
         self.warn_if_beyond(
             self.seen_rim < 1.0 and self._rim_on(instrument) < instrument.field_of_view / 2, "instrument"
         )
@@ -215,7 +214,7 @@ class Observation:
         return instrument.hits(hits, self.detector.distance, seed=seed)
 
 
-def behind(run: "Run", lens: LocalElectrode) -> "Run":
+def behind(run: _Table, lens: LocalElectrode) -> _Table:
     """The same run with a lens."""
     check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
     history = RadiusHistory(run.cap.ions, run.cap.radii, run.cap.apexes)
@@ -223,16 +222,16 @@ def behind(run: "Run", lens: LocalElectrode) -> "Run":
     return replace(run, settings=run.settings | {"microscope": to_plain(imaged)})
 
 
-def on_detector(run: "Run", detector: Detector, lens: LocalElectrode | None) -> "Run":
+def on_detector(run: _Table, detector: Detector, lens: LocalElectrode | None) -> _Table:
     """The same ions on another detector, see `Run.on_detector`."""
     check_kind(detector, "detector", Detector, "a Detector")
     if lens is not None:
-        before = run.observation
+        before = Observation(run)
         run = behind(run, lens)
         before.operating.check_lens(lens, before.lens.lens)
     run = _with_detector(run, detector)
     edge = stereographic_rim(detector.polar_angle(detector.width / 2))
-    observation = run.observation
+    observation = Observation(run)
     observation.warn_if_beyond(observation.seen_rim < edge * (1 - 1e-6), "detector")
     return run
 

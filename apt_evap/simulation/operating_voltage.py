@@ -4,7 +4,7 @@ Both classes have the same attributes, so that whoever needs voltages, charges o
 """
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,10 +13,9 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap.detection.hits import Outcome
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.evaporation.voltage import VoltageControl
+from apt_evap.simulation.columns import Clock
 from apt_evap.simulation.real_units import RealColumns, RealUnits, random_of
-
-if TYPE_CHECKING:
-    from apt_evap.simulation.run import Run
+from apt_evap.simulation.run_table import RunTable
 
 
 class IonRates(NamedTuple):
@@ -30,10 +29,10 @@ class IonRates(NamedTuple):
     """Rate that the control of the voltage aims at, if there is one."""
 
 
-def rates_of_clock(run: Any, edges: Integers) -> IonRates:
-    """Rates of a run with a clock between these rows; the last edge is the end of the run."""
+def rates_of_clock(run: RunTable, clock: Clock, edges: Integers) -> IonRates:
+    """Rates of a run by its clock between these rows; the last edge is the end of the run."""
     pulse_length = run.settings.get("pulse_length")
-    time = np.add.reduceat(run.clock.waits, edges[:-1]) / (pulse_length or 1.0)
+    time = np.add.reduceat(clock.waits, edges[:-1]) / (pulse_length or 1.0)
     goal = (run.settings.get("control") or {}).get("rate")
     return IonRates(np.diff(edges) / time, "pulse" if pulse_length else "second", goal)
 
@@ -43,8 +42,8 @@ class SimulatedVoltage:
 
     Parameters
     ----------
-    run : Run
-        The run.
+    run : RunTable
+        The table of the run.
     """
 
     energies_as_flown = True
@@ -55,15 +54,12 @@ class SimulatedVoltage:
     cap_field: float | None = None
     """Mean field of the cap to which the voltage leads [V/nm], if there is one."""
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: RunTable) -> None:
         self.run = run
         self.flight_voltages = np.full(len(run), run.voltage)
         """Voltage of the free specimen in the flights [V], shape (n,), also if a control had another for the events."""
         self.voltages: Floats = self.flight_voltages if run.clock is None else run.clock.voltages
         """Voltage at each event [V], shape (n,)."""
-
-    def __repr__(self) -> str:
-        return f"{self.run.voltage:g} V"
 
     @property
     def is_constant(self) -> bool:
@@ -114,13 +110,9 @@ class SimulatedVoltage:
             f"{what} needs a run in real units: use run.at_evaporation_field(), or --real-units, got {self.run!r}"
         )
 
-    def in_real_units(self) -> "Run":
-        """The run in real units, at its evaporation field."""
-        return self.run.at_evaporation_field()
-
     def ion_rates(self, edges: Integers) -> IonRates | None:
         """Rates of the ions between these rows, by the clock of the run; None without one."""
-        return None if self.is_constant else rates_of_clock(self.run, edges)
+        return None if self.run.clock is None else rates_of_clock(self.run, self.run.clock, edges)
 
     def columns(self, times: Floats, outcome: Integers) -> dict[str, Any]:
         """Columns of `Hits` that depend on the voltage.
@@ -148,8 +140,8 @@ class RealVoltage:
 
     Parameters
     ----------
-    run : Run
-        The run.
+    run : RunTable
+        The table of the run.
     units : RealUnits
         Its operating point.
     real : RealColumns
@@ -159,20 +151,13 @@ class RealVoltage:
     energies_as_flown = False
     is_constant = False
 
-    def __init__(self, run: "Run", units: RealUnits, real: RealColumns) -> None:
+    def __init__(self, run: RunTable, units: RealUnits, real: RealColumns) -> None:
         self.run, self.units, self.real = run, units, real
         self.control, self.field_reference = units.control, units.field_reference
         self.cap_field = units.operating_field if self.field_reference == "cap" else None
         self.voltages = self.flight_voltages = real.voltages
         self.instrument_voltages = self.instrument_flight_voltages = real.instrument_voltages
         self.charges, self.masses = real.charges, real.masses
-
-    def __repr__(self) -> str:
-        if not len(self.run):
-            return f"{self.run.voltage:g} V"
-        low, high = (f"{voltage:.4g}" for voltage in (self.voltages.min(), self.voltages.max()))
-        voltages = low if low == high else f"{low} to {high}"
-        return f"{voltages} V, {self.units.operating_field:.3g} V/nm at the {self.units.field_reference}"
 
     @cached_property
     def energy_scales(self) -> Floats:
@@ -190,14 +175,10 @@ class RealVoltage:
         """Operating point of the run."""
         return self.units
 
-    def in_real_units(self) -> "Run":
-        """The run, which is in real units."""
-        return self.run
-
     def ion_rates(self, edges: Integers) -> IonRates | None:
         """Rates of the ions between these rows: by the clock, or by the pulses; None without both."""
         if self.run.clock is not None:
-            return rates_of_clock(self.run, edges)
+            return rates_of_clock(self.run, self.run.clock, edges)
         if self.control.pulse_fraction == 0:
             return None
         pulses = np.diff(self.real.pulse_ids[edges[1:] - 1], prepend=0)

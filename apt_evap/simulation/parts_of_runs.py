@@ -1,7 +1,7 @@
 """Parts of a run: selection of its rows, and parts joined to a run."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -10,12 +10,10 @@ from apt_evap.emission.perturbations import described
 from apt_evap.simulation.columns import check_sequence_of_ions, columns_of, every_column_of, parts_of
 from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.provenance import joined
-
-if TYPE_CHECKING:
-    from apt_evap.simulation.run import Run
+from apt_evap.simulation.run_table import RunTable
 
 
-def select_rows(run: "Run", rows: Any) -> dict[str, Any]:
+def select_rows(run: RunTable, rows: Any) -> dict[str, Any]:
     """Arguments of `Run` that differ for a part of the run with these rows, see `Run.__getitem__`."""
     if not isinstance(rows, slice):
         indices = np.asarray(rows)
@@ -27,7 +25,7 @@ def select_rows(run: "Run", rows: Any) -> dict[str, Any]:
     return parts_of(arrays, run.emissions.nearest_neighbour_distance)
 
 
-def join_parts(runs: "Sequence[Run]") -> dict[str, Any]:
+def join_parts(runs: Sequence[RunTable]) -> dict[str, Any]:
     """Arguments of `Run` of the joined parts that differ from those of the first one, see `Run.join`."""
     if not runs:
         raise ValueError("runs must be at least one part of a run, got none")

@@ -16,6 +16,7 @@ from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_seed, short_text
 from apt_evap._core.elementary import logarithm, total
+from apt_evap.detection.microscope.free_specimen import FreeSpecimen
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, PostIonisation
 from apt_evap.evaporation.voltage import VoltageControl
@@ -373,9 +374,10 @@ def real_units_of(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColum
 
 def _instrument_voltages(run, field_factor, voltages, operating_field):
     """Voltages of an instrument with a lens or a field factor, from those of the model."""
+    lens = run.lens or FreeSpecimen()
     if field_factor is None:
-        return run.observation.lens.voltages(voltages, run.emissions.ions, operating_field)
-    run.observation.lens.check_field_factor(field_factor)
+        return lens.voltages(voltages, run.emissions.ions, operating_field)
+    lens.check_field_factor(field_factor)
     radius = run.settings["tip"].get("apex_radius")
     if radius is None:
         raise ValueError("field_factor needs the apex radius, which a tip made from positions does not have")

@@ -1,43 +1,35 @@
-"""A run: the table of what evaporated, with one row per ion.
+"""A run: what evaporated, what an instrument sees of it, its parts and its files.
 
-What an instrument sees of it is in `apt_evap.simulation.observation`, its file in `apt_evap.simulation.run_hdf5`.
+The table is in `apt_evap.simulation.run_table`; the other modules, of one of these each, import that.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.codec import changed, from_plain
-from apt_evap._common.ion_random import IonRandom
-from apt_evap._common.notebook import as_table
-from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
+from apt_evap._common.codec import changed
+from apt_evap._common.types import AnyPath, Floats, Integers
 from apt_evap._common.validation import check_kind, check_seed, check_sequence
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.microscope.run_lens import RunLens
-from apt_evap.emission.emissions import Emissions
-from apt_evap.emission.perturbations import Perturbation, Unperturbed, perturbation_text
-from apt_evap.evaporation.state import EmitterState
+from apt_evap.emission.perturbations import Perturbation, perturbation_text
 from apt_evap.measures.point_cloud import PointCloud
-from apt_evap.simulation.columns import Clock, Column, every_column_of, fingerprint_of
-from apt_evap.simulation.flight.response import ResponseModel, Responses, ResponseSettings
-from apt_evap.simulation.history import CapHistory, History
 from apt_evap.simulation.observation import Observation, behind, on_detector
 from apt_evap.simulation.parts_of_runs import join_parts, select_rows
-from apt_evap.simulation.provenance import provenance_now
-from apt_evap.simulation.real_units import OperatingPoint, RealColumns, RealUnits, real_units_of
+from apt_evap.simulation.real_units import OperatingPoint, RealUnits, real_units_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
+from apt_evap.simulation.run_table import RunTable
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Run:
+class Run(RunTable):
     """Sequence of evaporated atoms, with the data for the hit positions of their ions.
 
     Returned by `Simulation.run` and `load`.
@@ -105,42 +97,6 @@ class Run:
     81 V
     """
 
-    emissions: Emissions
-    site: np.ndarray
-    species: np.ndarray
-    charges: np.ndarray
-    fields: np.ndarray
-    perturbations: tuple
-    flown: tuple
-    responses: Responses | None
-    seed: int
-    voltage: float
-    detector: Detector
-    response_settings: ResponseSettings
-    elements: tuple
-    settings: dict
-    history: History = field(default_factory=History.empty)
-    state: EmitterState | None = None
-    first_event: int = 0
-    ended: str = ""
-    provenance: dict = field(default_factory=provenance_now)
-    detached: Any = None
-    phase: Any = None
-    cap: CapHistory = field(default_factory=CapHistory.empty)
-    clock: Clock | None = None
-    events: dict[str, np.ndarray] = field(default_factory=dict)
-    units: RealUnits | None = None
-    real: RealColumns | None = None
-
-    def __post_init__(self):
-        if self.detached is None:
-            object.__setattr__(self, "detached", np.zeros(len(self.site), bool))
-        if self.phase is None:
-            object.__setattr__(self, "phase", np.zeros(len(self.site), np.int8))
-
-    def __len__(self) -> int:
-        return len(self.site)
-
     def __getitem__(self, rows: Any) -> "Run":
         """Part of the run: only the selected ions, as if the others had not been recorded.
 
@@ -166,35 +122,6 @@ class Run:
         return replace(self, **select_rows(self, rows))
 
     @property
-    def every_column(self) -> list[Column]:
-        """The columns of this run, see `apt_evap.simulation.columns`."""
-        return every_column_of(self)
-
-    _repr_html_ = as_table
-
-    def __repr__(self) -> str:
-        flown = ", ".join(perturbation_text(perturbation) for perturbation in self.perturbations)
-        responses = "" if self.responses is None else f"responses, {self.flagged.sum():,} of them flagged"
-        if not_flown := int(self.not_flown.sum()):
-            responses += f"; {not_flown:,} ions not flown"
-        details = "; ".join(part for part in (responses, flown and f"flown: {flown}", self.ended) if part)
-        operating = self.observation.operating
-        return f"<Run: {len(self):,} ions of {', '.join(dict.fromkeys(self.elements))} at {operating}; {details}>"
-
-    @property
-    def phase_names(self) -> tuple[str, ...]:
-        """Names of the phases of the specimen; ("matrix",) if there is only one."""
-        return tuple(phase["name"] for phase in self.settings["tip"].get("phases", ())) or ("matrix",)
-
-    @property
-    def evaporation_fields(self) -> Floats:
-        """Evaporation field of the species of each ion [V/nm], shape (n,)."""
-        tip = self.settings["tip"]
-        # in the order of the species; two of them may have the same name
-        materials = tip.get("elements") or [tip["material"], *(material for material, _ in tip["solutes"])]
-        return np.array([material["evaporation_field"] for material in materials])[self.species]
-
-    @property
     def voltages(self) -> Floats:
         """Voltage at each event [V], shape (n,): constant, that of the control, or in real units that of the model.
 
@@ -206,12 +133,6 @@ class Run:
     def instrument_voltages(self) -> Floats:
         """Voltage between specimen and electrode at each event [V], shape (n,), at the top of the pulse."""
         return self.observation.operating.instrument_voltages
-
-    @cached_property
-    def lens(self) -> RunLens | None:
-        """The lens in front of the specimen; None for a specimen in free space."""
-        plain = self.settings.get("microscope")
-        return None if plain is None else from_plain(plain, RunLens, what="microscope")
 
     @property
     def flight_charges(self) -> Integers:
@@ -226,58 +147,12 @@ class Run:
         """
         return self.observation.operating.energy_scales
 
-    @property
-    def field_of_view(self) -> float | None:
-        """Largest polar angle of the flights that count [degrees]; None if all do, see `FlightSettings`."""
-        return self.settings.get("flights", {}).get("field_of_view")
-
-    @property
-    def not_flown(self) -> Booleans:
-        """Ions without responses, because they cannot arrive in the field of view of the flights, bool (n,)."""
-        if self.responses is None or self.responses.not_flown is None:
-            return np.zeros(len(self), bool)
-        return self.responses.not_flown
-
-    @property
-    def response_model(self) -> ResponseModel:
-        """Launches, fit and evaluation of the responses."""
-        return ResponseModel(self.response_settings, self.detector)
-
-    @property
-    def flagged(self) -> Booleans:
-        """Ions whose responses deviate from their own flights by more than the bound, or have no fit, bool (n,)."""
-        if self.responses is None:
-            return np.zeros(len(self), bool)
-        return self.response_model.flagged(self.responses, self.emissions)
-
-    @property
-    def first_perturbation(self) -> Any:
-        """The first perturbation flown in the run; `Unperturbed` if there are only responses."""
-        return self.perturbations[0] if self.flown else Unperturbed()
-
-    def fingerprint(self) -> str:
-        """Hash of all results, to compare runs.
-
-        Returns
-        -------
-        str
-            SHA-256 over the names, types and values of the columns: emissions, sites, species, charges, fields, times
-            and voltages of a control, flown perturbations and responses, but not the real units, which follow from
-            them. By design it does not depend on the machine.
-        """
-        return fingerprint_of(self)
-
     # ---- observation -----------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def observation(self) -> Observation:
         """What an instrument sees of the run: voltages, lens, detector and field of view."""
-        return Observation(self)
-
-    @cached_property
-    def ion_random(self) -> IonRandom:
-        """Random numbers of the ions, the same for every perturbation."""
-        return IonRandom(self.seed, self.emissions.ions)
+        return Observation(RunTable(**self.__getstate__()))  # of the run itself, both would wait for the collector
 
     def hits(self, perturbation: Perturbation, *, by_response: bool = False) -> Hits:
         """Hits of the ions for a perturbation.
@@ -318,7 +193,7 @@ class Run:
         --------
         >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), solutes={"Al": 0.1}, seed=1)
         >>> ae.Simulation(tip, seed=1).run(100).sites()
-        <PointCloud: 100 ions from 'sites of the run', 3.1 x 3.2 x 0.4 nm; Ni 86, Al 14>
+        <PointCloud: 100 ions from 'sites of the run', 3.9 x 4.0 x 3.5 nm; Ni 51, Al 49>
         """
         names = tuple(dict.fromkeys(self.elements))  # phases may share an element
         number = np.array([names.index(element) for element in self.elements])
@@ -413,20 +288,11 @@ class Run:
 
     def in_real_units(self) -> "Run":
         """The same run in real units: itself if it is, otherwise at its evaporation field."""
-        return self.observation.operating.in_real_units()
+        return self.at_evaporation_field() if self.units is None else self
 
     def require_real_units(self, what: str) -> RealUnits:
         """Operating point of a run in real units; ValueError, which begins with `what` needs it, for any other."""
         return self.observation.operating.require_units(what)
-
-    def require_responses(self, name: str = "run") -> Responses:
-        """Responses of the run; ValueError, which begins with this name of the run, if there are none."""
-        if self.responses is None:
-            raise ValueError(
-                f"{name} must have responses, got {self!r}: repeat it with responses=True, or responses = true in "
-                "[simulation] of its settings file"
-            )
-        return self.responses
 
     def on_detector(self, detector: Detector, lens: LocalElectrode | None = None) -> "Run":
         """The same ions on another detector.

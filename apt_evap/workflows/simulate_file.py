@@ -88,6 +88,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     checkpoint: float = 10.0,
+    own_classes: bool = False,
     progress: Any = None,
     note: Callable[[str], None] = no_note,
 ) -> Simulated:
@@ -116,6 +117,8 @@ def simulate(
         Whether to replace unfinished and other runs, and files that were not made by this package.
     checkpoint : float
         Time between two checkpoints [min].
+    own_classes : bool
+        Whether modules with classes of one's own are imported, which executes them; as for `read_config`.
     progress : bool or callable, optional
         As for `Simulation.run`. A callable is also called at the beginning. One that is a context manager is entered
         for the time of the events.
@@ -153,7 +156,7 @@ def simulate(
     >>> len(done.run), done.path.name, done.picture.name
     (100, 'tiny.h5', 'tiny.png')
     """
-    config = _config(check_path(settings), ions=ions, seed=seed)
+    config = _config(check_path(settings), own_classes, ions=ions, seed=seed)
     path = check_path(output or config.output or f"{config.path.stem}.h5")
     if path.suffix.lower() != ".h5":
         raise FileError(f"a run is saved in an HDF5 file with the suffix .h5, got {str(path)!r}")
@@ -198,12 +201,12 @@ def simulate(
     return Simulated(run, path, picture, maps, titles, seconds)
 
 
-def _config(settings: Path, **changes: int | None) -> Config:
+def _config(settings: Path, own_classes: bool, **changes: int | None) -> Config:
     """Settings of a file, with changed values of the table [simulation] unless they are None."""
     document = read_document(settings)
     if isinstance(table := document.get("simulation", {}), dict):  # config_of refuses anything else
         document["simulation"] = table | {name: value for name, value in changes.items() if value is not None}
-    config = config_of(document, settings, own_classes=True)
+    config = config_of(document, settings, own_classes=own_classes)
     if "responses" in document and not config.responses:
         warn("the table [responses] is not used: [simulation] has responses = false", WorkflowWarning)
     return config

@@ -2,6 +2,8 @@
 
 import json
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,7 +73,18 @@ class Ball:
         return np.sqrt((points**2).sum(axis=1)) - self.radius
 
 
+class Inside:
+    def __call__(self, points):
+        return points[:, 0] > 0
+
+
+def made():
+    return BoundAtoms(1.0)
+
+
 class Broken:
+    keys = BoundAtoms.keys
+
     def __init__(self):
         raise KeyError("broken")
 '''
@@ -99,7 +112,7 @@ def folder(tmp_path, monkeypatch):
 def read(folder, text, responses="true"):
     path = folder / "a.toml"
     path.write_text(SETTINGS.format(responses=responses) + text)
-    return read_config(path)
+    return read_config(path, own_classes=True)
 
 
 @pytest.mark.slow
@@ -156,7 +169,7 @@ def test_a_rule_bonds_and_a_region_of_ones_own(folder):
     text = '[tip]\napex_radius = 1.5\nseed = 1\n[simulation]\nions = 5\n[[phases]]\nname = "a:b"\nmaterial = "Ni"\n'
     text += '[[phases]]\nname = "ball"\nmaterial = "Ni"\nsolutes = { Al = 0.5 }\n'
     (folder / "b.toml").write_text(text + 'region = { name = "mine:Ball", radius = 1.0 }\n')
-    phases = read_config(folder / "b.toml").tip["phases"]
+    phases = read_config(folder / "b.toml", own_classes=True).tip["phases"]
     assert phases[0].name == "a:b" and phases[1].region.radius == 1.0
 
 
@@ -187,6 +200,9 @@ def test_a_module_of_the_python_path(folder, monkeypatch):
         ("law", 'name = "mine:BoundAtoms"\nwrong = 1'),
         ("law", 'name = "mine:Ball"\nradius = 1.0'),
         ("law", 'name = "json:dumps"\nobj = 1'),
+        ("law", 'name = "shelve:DbfilenameShelf"\nfilename = "written"'),  # has a method keys, without arguments
+        ("law", 'name = "mine:made"'),
+        ("region", 'name = "mine:Inside"'),  # a function of points
         ("law", 'name = "syntax:Law"'),
         ("rule", 'name = "mine:BoundAtoms"\nper_bond = 0.1'),
         ("maps", 'panels = [{ perturbation = { name = "mine:Ball", radius = 1.0 } }]'),
@@ -194,19 +210,34 @@ def test_a_module_of_the_python_path(folder, monkeypatch):
 )
 def test_what_is_wrong_is_one_sentence(folder, table, text):
     (folder / "syntax.py").write_text("class = 3")
+    header = '[[phases]]\nmaterial = "Ni"\n[phases.region]' if table == "region" else f"[{table}]"
     with pytest.raises(FileError, match=r"a\.toml'") as refused:
-        read(folder, f"[{table}]\n{text}\n")
+        read(folder, f"{header}\n{text}\n")
     assert len(str(refused.value).splitlines()) == 1 and len(str(refused.value)) < 500
+    assert not list(Path().glob("written*"))
+
+
+def test_the_class_is_not_made_before_it_is_known_to_be_one_of_the_interface(folder):
+    """Popen is a class, but no perturbation."""
+    program = f'["{sys.executable}", "-c", "open(\'executed\', \'w\')"]'
+    text = f'[[maps.panels]]\nperturbation = {{ name = "subprocess:Popen", args = {program} }}\n'
+    with pytest.raises(FileError, match=r"launch\(emissions, random\), got .*Popen"):
+        read(folder, text)
+    time.sleep(0.2)
+    assert not Path("executed").exists()
 
 
 def test_settings_that_the_user_has_not_given_import_nothing(folder):
     (folder / "mine.py").write_text("open('imported', 'w')")
     path = folder / "a.toml"
     path.write_text(SETTINGS.format(responses="true") + '[law]\nname = "mine:BoundAtoms"\nper_bond = 0.05\n')
-    with pytest.raises(FileError, match="mine:BoundAtoms"):
-        config_of(read_document(path), path)
+    for reader in (read_config, ae.simulate, lambda path: config_of(read_document(path), path)):
+        with pytest.raises(FileError, match=r"mine:BoundAtoms.*own_classes=True"):
+            reader(path)
     (folder / "study.toml").write_text('base = "a.toml"\n[sweep]\n"tip.apex_radius" = [1.5, 2.0]\n')
     assert main(["sweep", str(folder / "study.toml"), "-o", "work", "--plan"]) == 2
     with pytest.raises(ValueError, match="mine:FromAbove"):
         read_perturbation(json.loads('{"name": "mine:FromAbove", "height": 0.3}'))
+    with pytest.raises(ValueError, match="own_classes"):
+        read_config(path, own_classes="yes")
     assert not list(folder.rglob("imported"))

@@ -90,12 +90,12 @@ def test_ions_of_files_with_ranges():
         composition=[{"Cr": 1, "O": 1}, {"Cr": 1}, {"Cr": 1, "O": 1}],
     )
     ions = ae.Hits(positions=[[0, 0, 0], [0, 0, 1], [0, np.nan, 0], [1, 1, 1.0]], mass_to_charge=[68, 52, 52, 99.0])
-    cloud = ae.measures.point_cloud(ions, ranges)
+    cloud = ae.measures.PointCloud.of(ions, ranges)
     assert len(cloud) == 3 and cloud.species.tolist() == [0, 1, -1]
     assert cloud.count_atoms() == {"Cr": 2, "O": 1}
-    assert ae.measures.point_cloud(ions).names == ("ion",)
+    assert ae.measures.PointCloud.of(ions).names == ("ion",)
     with pytest.raises(ValueError, match="positions"):
-        ae.measures.point_cloud(ae.Hits(x=[0.0], y=[1.0]))
+        ae.measures.PointCloud.of(ae.Hits(x=[0.0], y=[1.0]))
 
 
 def test_a_profile_counts_all_ions_of_a_region():
@@ -173,3 +173,19 @@ def test_sites_of_a_run_and_its_reconstruction():
     assert np.array_equal(clusters.members, volume.cloud().clusters("Al", 0.3, 3).members)
     profile = volume.proxigram(surface=ae.specimen.HalfSpace((0, 0, 0.3), (0, 0, 1)), reach=0.5)
     assert 0 < profile.atoms.sum() < len(volume)
+
+
+def test_pictures():
+    cloud = blurred_ball(3, 20_000)
+    clusters = cloud.clusters("Cu", 0.4, 50)
+    axes = ae.plot.clusters(clusters)
+    assert axes[2].get_xlabel() == "solutes of a cluster" and axes[0].get_aspect() == 1
+    ax = ae.plot.composition_profile(cloud.proxigram(surface=ae.specimen.Sphere((0, 0, 0), RADIUS)), "Cu")
+    (line,) = (container[0] for container in ax.containers)
+    x, y = line.get_data()
+    inner = y[(x > -1.2) & (x < -0.6)].mean()
+    assert inner == pytest.approx(80 - 3, abs=4)  # per cent; two and more blurs inside, 500 ions: three errors of 1.8
+    with pytest.raises(ValueError, match="elements must be one of Al, Cu, got 'Ag'"):
+        ae.plot.composition_profile(cloud.profile(), "Ag")
+    with pytest.raises(ValueError, match="result must be Clusters"):
+        ae.plot.clusters(cloud)

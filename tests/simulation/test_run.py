@@ -1,3 +1,5 @@
+import pickle
+import weakref
 from dataclasses import dataclass, replace
 
 import h5py
@@ -54,6 +56,28 @@ def same_hits(one, other):
         np.array_equal(getattr(one, name), getattr(other, name), equal_nan=getattr(one, name).dtype.kind == "f")
         for name in one.columns
     )
+
+
+# ---- observation ---------------------------------------------------------------------------------------------------
+
+
+def test_the_observation_of_a_run_is_one_object(run):
+    part = run[:20]
+    assert part.observation is part.observation and part.observation is not run.observation
+    assert replace(part, ended="stopped").observation is not part.observation
+    x, y, _ = part.places(ae.RollUp(ENERGY))
+    copied = pickle.loads(pickle.dumps(part))
+    assert set(vars(copied)) == set(vars(run[:20])), "what was computed is not copied"
+    assert same_bits(part, copied)
+    assert np.array_equal(copied.places(ae.RollUp(ENERGY))[:2], (x, y), equal_nan=True)
+
+
+def test_a_run_with_an_observation_needs_no_garbage_collector(run):
+    part = run[:20]
+    part.hits(ae.Unperturbed())
+    gone = weakref.ref(part)
+    del part
+    assert gone() is None
 
 
 # ---- columns -------------------------------------------------------------------------------------------------------

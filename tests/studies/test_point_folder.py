@@ -101,7 +101,7 @@ def test_a_failed_point_waits_for_retry(sweep, tmp_path, capsys):
 
 
 def test_an_error_that_is_not_expected_fails_the_point_too(sweep, monkeypatch):
-    monkeypatch.setattr(point_folder, "read_config", lambda path: {}["tip"])
+    monkeypatch.setattr(point_folder, "config_of", lambda document, path: {}["tip"])
     state = run_point(sweep.folder_of(sweep.keys[0]))
     assert state.name == "failed" and state.message == "KeyError: 'tip'"
 
@@ -129,7 +129,7 @@ def test_too_little_memory_is_no_failure(sweep, monkeypatch):
     def read(path):
         raise MemoryError("too little memory")
 
-    monkeypatch.setattr(point_folder, "read_config", read)
+    monkeypatch.setattr(point_folder, "read_document", read)
     state = run_point(sweep.folder_of(sweep.keys[0]))
     assert state.name == "waiting" and "too little memory" in state.message
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import scipy
@@ -17,9 +17,6 @@ from apt_evap.detection.microscope.conductors import simulated_flank
 from apt_evap.detection.microscope.lens import Lens
 from apt_evap.detection.microscope.local_electrode import LensProjection, LocalElectrode
 from apt_evap.units import FLIGHT_TIME, NM_PER_MM
-
-if TYPE_CHECKING:
-    from apt_evap.specimen.tip import Tip
 
 _FAR = 1e9  # distance and aperture of an electrode without effect on the specimen: 1 m [nm]
 _FAR_ANGLE = math.radians(75)
@@ -264,7 +261,21 @@ class RunLens:
         return rows[first] * (1 - share) + rows[first + 1] * share
 
 
-def field_of_view(lens: LocalElectrode, tip: "Tip", detector: Detector) -> float:
+class ShapedSpecimen(Protocol):
+    """What the field of view needs of a `Tip`."""
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Its settings, in plain types."""
+        ...
+
+    @property
+    def nearest_neighbour_distance(self) -> float:
+        """Distance between nearest neighbours [nm]."""
+        ...
+
+
+def field_of_view(lens: LocalElectrode, tip: ShapedSpecimen, detector: Detector) -> float:
     """Polar angle of the simulated flights that covers a detector behind a lens, for `FlightSettings`.
 
     Parameters

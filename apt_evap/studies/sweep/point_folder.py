@@ -18,7 +18,7 @@ from apt_evap._common.checked_hdf5 import label_of
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
 from apt_evap._common.locks import open_lock, try_lock
 from apt_evap._common.types import AnyPath
-from apt_evap.config.simulation_file import read_config
+from apt_evap.config.simulation_file import config_of, key_of, read_document
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.stop_reason import StopReason
 
@@ -152,9 +152,8 @@ def run_point(folder: AnyPath, threads: int = 1, checkpoint: float = 10.0) -> Po
 def _run(folder, threads, checkpoint):
     for name in os.listdir(folder):
         unlinked(folder / name)
-    config = read_config(folder / SETTINGS)
-    if config.key != folder.name:
-        raise FileError(f"{str(config.path)!r} has other settings than the plan: apt-evap sweep plan writes it again")
+    path = folder / SETTINGS
+    config = config_of(_planned(path), path)
     run = config.simulation(n_threads=threads).run(
         config.n_ions,
         config.emissions,
@@ -165,6 +164,18 @@ def _run(folder, threads, checkpoint):
     if run.ended == StopReason.INTERRUPTED:
         raise KeyboardInterrupt
     config.as_saved(run).save(folder / RUN)
+
+
+def _planned(path):
+    """Content of the settings of a point; FileError, before anything of it is used, if it is not that of the plan."""
+    document = read_document(path)
+    try:
+        key = key_of(document)
+    except ValueError as error:
+        raise FileError(f"{str(path)!r}: {error}") from error
+    if key != path.parent.name:
+        raise FileError(f"{str(path)!r} has other settings than the plan: apt-evap sweep plan writes it again")
+    return document
 
 
 def _is_of_the_system(error):

@@ -1,0 +1,214 @@
+"""A folder of somebody else: whatever lies beside, above or inside what is opened, its code is not executed."""
+
+import shutil
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
+from apt_evap.cli.main import main
+from apt_evap.cli.parser import COMMANDS, make_parser
+from apt_evap.config.simulation_file import read_config
+from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.fit.start_settings import is_start
+from apt_evap.studies.sweep.planning import plan_sweep
+from apt_evap.workflows.kept_files import KeptFiles
+from apt_evap.workflows.twin_of_map import twin
+
+CLASSES = '''
+import pathlib
+(pathlib.Path(__file__).parent / "EXECUTED").touch()
+class Mine:
+    """All interfaces at once."""
+    def __init__(self, **_): pass
+    def launch(self, emissions, random): raise ValueError
+    def keys(self, tip, atoms, fields, bonds): raise ValueError
+    def solve(self, positions, normals, charges, field_of, potential, tolerance): raise ValueError
+    def solve_patch(self, positions, normals, charges, field): raise ValueError
+    def quantile(self, u): return u
+    def probabilities(self, emissions): raise ValueError
+    def distance(self, points): return points[:, 0]
+'''
+TIP = '[tip]\nmaterial = "Ni"\napex_radius = 1.5\naxis = [1, 1, 1]\nshank_length = 1.0\n'
+SIMULATION = "[simulation]\nions = 30\n"
+START = "# Settings of a simulation, made from a measured map by apt_evap 0.1.0.\n"
+PANELS = (
+    '\n[[maps.panels]]\nperturbation = {{ name = "mine:Mine" }}\n[[maps.panels]]\nperturbation = {{ name = "{}" }}\n'
+)
+# further places of a class in settings, each in a file of its own
+PLACES = {
+    "law": '[law]\nname = "mine:Mine"\n',
+    "bonds": '[law]\nname = "Extremal"\nbonds = { name = "mine:Mine" }\n',
+    "rule": '[rule]\nname = "mine:Mine"\n',
+    "energy": '[[maps.panels]]\nperturbation = { name = "RollUp", energy = { name = "mine:Mine" } }\n',
+    "probability": '[[maps.panels]]\nperturbation = { name = "RollUp", energy = 0.1, '
+    'probability = { name = "mine:Mine" } }\n',
+    "region": '[[phases]]\nname = "a"\nmaterial = "Ni"\n[[phases]]\nname = "b"\nmaterial = "Ni"\n'
+    'region = { name = "mine:Mine" }\n',
+}
+
+
+@pytest.fixture(scope="module")
+def hostile(tmp_path_factory):
+    """Harmless files among settings and modules that execute code."""
+    folder = tmp_path_factory.mktemp("hostile")
+    evil = START + TIP + SIMULATION + PANELS.format("subprocess:Popen")
+    for name in ("mine", "numpy", "apt_evap", "sitecustomize", "conftest", "study", "own", "run"):
+        (folder / f"{name}.py").write_text(CLASSES)
+    (folder / "matplotlibrc").write_text("backend: module://mine\n")
+    tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.0)
+    ae.Simulation(tip, n_threads=1).run(60, progress=False).save(folder / "run.h5")
+    random = np.random.default_rng(0)
+    n = 3000
+    x, y = random.normal(0, 8, (2, n)).astype("f4")
+    hits = ae.Hits(
+        x=x,
+        y=y,
+        voltage=np.linspace(3000, 4000, n).astype("f4"),
+        pulse_voltage=np.zeros(n, "f4"),
+        mass_to_charge=np.full(n, 29.0, "f4"),
+        time_of_flight=np.full(n, 500.0, "f4"),
+        positions=np.zeros((n, 3), "f4"),
+        multiplicity=np.ones(n, int),
+        pulse_id=np.arange(n),
+    )
+    ae.write(folder / "ions.epos", hits)
+    counts = hits.map(bins=64)
+    edges = {"x_edges_mm": counts.x_edges, "y_edges_mm": counts.y_edges}
+    np.savez(folder / "map.npz", counts=counts.values, **edges)
+    for name in ("run", "ions", "map", "settings", "specimen", "Ni"):
+        (folder / f"{name}.toml").write_text(evil)
+    assert is_start(folder / "run.toml")
+    (folder / "own.toml").write_text(TIP + SIMULATION)
+    (folder / "base.toml").write_text(TIP + SIMULATION)
+    (folder / "study.toml").write_text('base = "base.toml"\n[sweep]\n"simulation.seed" = [1, 2]\n[dataset]\n')
+    sweep = plan_sweep(folder / "study.toml")
+    for key in sweep.keys:
+        settings = sweep.folder_of(key) / "settings.toml"
+        settings.write_text(settings.read_text() + PANELS.format("subprocess:Popen"))  # with the same key
+        (settings.parent / "mine.py").write_text(CLASSES)
+    (folder / "visible.toml").write_text(TIP + SIMULATION + PANELS.format("subprocess:Popen") + "[visibility]\n")
+    return folder
+
+
+@pytest.fixture
+def folder(hostile, tmp_path, monkeypatch):
+    """A copy, in which the test works; afterwards nothing has been executed."""
+    copy = tmp_path / "copy"
+    shutil.copytree(hostile, copy)
+    monkeypatch.chdir(copy)
+    yield copy
+    assert not [path for path in copy.rglob("*") if path.name == "EXECUTED"]
+    assert "mine" not in sys.modules
+
+
+RUNS = {
+    "run": [("run", "own.toml", "--quiet"), ("run", "own.toml", "--resume", "--quiet")],
+    "map": [("map", "run.h5"), ("map", "ions.epos"), ("map", "map.npz")],
+    "info": [("info", "run.h5"), ("info", "ions.epos"), ("info", "map.npz")],
+    "spectrum": [("spectrum", "ions.epos")],
+    "index": [("index", "ions.epos", "--element", "Ni", "--scales", "50,50")],
+    "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50")],
+    "export": [("export", "run.h5", "-o", "x.pos"), ("export", "ions.epos", "-o", "x.csv")],
+    "reconstruct": [("reconstruct", "ions.epos", "--element", "Ni", "--distance", "90")],
+    "examples": [("examples", "--to", "copied")],
+    "completion": [("completion", "bash")],
+    "compare": [
+        (
+            "compare",
+            "run.h5",
+            "ions.epos",
+            "--bins",
+            "16",
+            "--means",
+            "0.1,0.2",
+            "--replicas",
+            "1",
+            "--registration",
+            "0,1,0,0",
+        )
+    ],
+    "sweep": [
+        ("sweep", "status", "study.toml"),
+        ("sweep", "work", "study.toml", "--quiet"),
+        ("sweep", "work", "study.toml", "--point", "0"),
+        ("sweep", "collect", "study.toml"),
+    ],
+    "dataset": [("dataset", "study.toml", "-o", "set")],
+    "visible": [("visible", "visible.toml")],
+}
+"""Command lines of all commands but two: `explore` and `twin` are below."""
+SLOW = ("index", "start", "compare")
+
+
+def test_every_command_is_here():
+    assert set(RUNS) | {"explore", "twin"} == set(COMMANDS)
+
+
+LINES = [
+    pytest.param(words, id=" ".join(words[:2]), marks=[pytest.mark.slow] if words[0] in SLOW else [])
+    for lines in RUNS.values()
+    for words in lines
+]
+
+
+@pytest.mark.parametrize("words", LINES)
+def test_a_command_executes_nothing_that_it_finds(folder, words):
+    assert main(list(words)) in (0, 2)  # 2: a file is refused
+
+
+def test_a_file_that_is_opened_in_the_explorer_executes_nothing_beside_it(folder):
+    options = make_parser("explore").parse_args(["explore", "run.h5", "ions.epos"])
+    explorer_and_view(options)
+    for name in ("run.h5", "map.npz", "ions.epos"):
+        with_file(options, name)
+    running = BackgroundRun(folder / "run.toml", folder / "other.h5")  # what the page writes has no such class
+    running.stop(wait=True)
+    assert not running.finished and "own_classes" in running.message
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the map does not decide")
+def test_a_folder_of_a_twin_executes_nothing(folder):
+    """Its record is right: it came with the measurement."""
+    kept = {}
+    write = KeptFiles.write
+
+    def stop(self, files, others=()):
+        kept.update(files)
+        changed = {
+            name: content + PANELS.format("subprocess:Popen").encode() if name.endswith("toml") else content
+            for name, content in files.items()
+        }
+        write(self, changed, others)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(KeptFiles, "write", stop)
+        twin("ions.epos", "Ni", scales=(50, 50), minutes=0.5, threads=1)
+    (folder / "ions_twin" / "mine.py").write_text(CLASSES)
+    with pytest.raises(ae.FileError, match="own_classes"):
+        twin("ions.epos", "Ni", scales=(50, 50), minutes=0.5, threads=1)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_settings_with_a_class_are_read_only_with_the_switch(folder, place):
+    tip = TIP.replace('material = "Ni"\n', "") if place == "region" else TIP
+    Path("a.toml").write_text(tip + SIMULATION + PLACES[place])
+    for reader in (read_config, ae.simulate):
+        with pytest.raises(ae.FileError, match="apt-evap run names, or with own_classes=True"):
+            reader("a.toml")
+
+
+@pytest.mark.parametrize(
+    "reader",
+    [ae.read, ae.load, ae.read_tip, ae.io.read_map, ae.io.read_ranges, ae.io.read_grid, read_config],
+)
+def test_a_reader_executes_nothing(folder, reader):
+    for name in ("run.h5", "ions.epos", "map.npz", "run.toml", "mine.py", "study.toml"):
+        with suppress(ae.FileError):
+            reader(name)
