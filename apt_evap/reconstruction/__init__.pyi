@@ -6,8 +6,6 @@ from .calibration import find_planes as find_planes
 from .consistency import checks as checks
 from .constants import run_constants as run_constants
 from .evolving import EvolvingReconstruction as EvolvingReconstruction
-from .interface import interface_profile as interface_profile
-from .interface import segregation_profile as segregation_profile
 from .origins import origin_table as origin_table
 from .position_errors import local_scatter as local_scatter
 from .position_errors import position_covariances as position_covariances
