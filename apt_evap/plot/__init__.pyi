@@ -10,6 +10,7 @@ from .map_figures import detector_map as detector_map
 from .map_figures import detector_maps as detector_maps
 from .measure_figures import clusters as clusters
 from .measure_figures import composition_profile as composition_profile
+from .measure_figures import truth_comparison as truth_comparison
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
 from .paper_figures import paper_maps as paper_maps

@@ -9,3 +9,5 @@ from .origins import origin_table as origin_table
 from .precipitate import precipitate_errors as precipitate_errors
 from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
 from .shank import fit_shank as fit_shank
+from .truth_comparison import compare_with_truth as compare_with_truth
+from .truth_comparison import corrected as corrected
