@@ -3,6 +3,7 @@
 import gc
 import hashlib
 import os
+import pickle
 import shutil
 import signal
 import sys
@@ -24,7 +25,9 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
+from apt_evap._common.files import replace_file
 from apt_evap._common.locks import FileLock
+from apt_evap.maps.indexing.master_pattern import master_patterns
 
 PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
@@ -66,20 +69,56 @@ def hash_of(*parts):
     return hashed.hexdigest()[:24]
 
 
-@pytest.fixture(scope="session")
-def kept_runs(pytestconfig, tmp_path_factory):
-    """Folder of the runs of this core: it outlives the tests, and goes when what computes a run has changed."""
-    if not hasattr(pytestconfig, "cache"):  # without the plugin of pytest
-        return tmp_path_factory.mktemp("runs")
+def kept_folder(config, tmp_path_factory, name, packages):
+    """Folder of what these packages compute: it outlives the tests, and goes when their code has changed."""
+    if not hasattr(config, "cache"):  # without the plugin of pytest
+        return tmp_path_factory.mktemp(name)
     package = Path(ae.__file__).parent
-    paths = [path for name in PACKAGES_OF_RUNS for path in sorted((package / name).rglob("*")) if path.is_file()]
-    sources = [path.read_bytes() for path in paths if path.suffix in (".py", ".so", ".pyd")]
-    folder = pytestconfig.cache.mkdir("runs") / hash_of(*sources)
+    paths = [path for part in packages for path in sorted((package / part).rglob("*")) if path.is_file()]
+    sources = [path.read_bytes() for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
+    folder = config.cache.mkdir(name) / hash_of(*sources)
     folder.mkdir(exist_ok=True)
     for other in folder.parent.iterdir():
         if other != folder:
             shutil.rmtree(other, ignore_errors=True)
     return folder
+
+
+@pytest.fixture(scope="session")
+def kept_runs(pytestconfig, tmp_path_factory):
+    """Folder of the runs of this core."""
+    return kept_folder(pytestconfig, tmp_path_factory, "runs", PACKAGES_OF_RUNS)
+
+
+@pytest.fixture(scope="session")
+def indexed_once(pytestconfig, tmp_path_factory):
+    """`ae.index`, computed by the first test that needs it."""
+    packages = ("_common", "_core", "specimen", "detection", "maps")
+    folder = kept_folder(pytestconfig, tmp_path_factory, "indexings", packages)
+
+    def indexed(measured, material, **options):
+        key = hash_of(pickle.dumps((measured, material, sorted(options.items()))))
+        path = folder / f"{key}.pickle"
+        lock = FileLock(path.with_suffix(".lock"), key, wait=lambda: None)
+        try:
+            if not path.exists():
+                indexing = ae.index(measured, material, **options)
+                with replace_file(path) as file:
+                    pickle.dump(indexing, file)
+        finally:
+            lock.release()
+        return pickle.loads(path.read_bytes())
+
+    return indexed
+
+
+@pytest.fixture(scope="session")
+def indexed_nickel(indexed_once):
+    """Orientation of nickel, a map of it at a scale of 60 mm/rad, and what `ae.index` says of this map."""
+    truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    pattern = master_patterns("fcc")[0]
+    measured = pattern.map(truth, ae.detection.Projection(60.0), 70.0, ions=30_000, rolled=0.5, seed=1)
+    return truth, indexed_once(measured, "Ni", scales=(54, 66), patterns=[pattern])
 
 
 @pytest.fixture(scope="session")
