@@ -16,10 +16,10 @@ from bokeh.models import (
 )
 from bokeh.palettes import Inferno256, interp_palette
 
+from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.explore.style import STYLES, VEIL
 from apt_evap.explore.widgets import LEFT, color_bar, show_extent, square
-from apt_evap.plot.limits import color_limits, common_limits
 
 MODES = ("side by side", "difference", "blink")
 """What the page shows beside the simulated map, if there is a measured one."""

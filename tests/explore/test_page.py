@@ -12,9 +12,9 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
+from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.specimen_surface import surface_atoms
-from apt_evap.plot.limits import color_limits, common_limits
 
 pytest.importorskip("bokeh")
 
