@@ -30,17 +30,7 @@ _OUTSIDE = "#00000000"
 
 
 class MapFigures:
-    """Figures of the maps, and the widgets that choose what they show.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Has a run, a measurement, or both.
-    maps : ExplorerMaps
-        Maps at the start.
-    document : bokeh.document.Document
-        Calls the function that exchanges the maps in the mode "blink".
-    """
+    """Figures of the maps, and the widgets that choose what they show."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, document: Document) -> None:
         self._explorer, self._maps, self._document = explorer, maps, document

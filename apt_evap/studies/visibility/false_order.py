@@ -42,19 +42,7 @@ class Estimated(NamedTuple):
 
 @dataclass(frozen=True)
 class FalseOrder:
-    """Warren-Cowley parameters of a random alloy after its evaporation.
-
-    Parameters
-    ----------
-    reconstructed : Estimated
-        Of the reconstructed positions.
-    shuffled : Estimated
-        Mean and standard deviation for labels that are permuted among the same positions.
-    true : Estimated
-        Of the true sites of the same ions.
-    ions, solutes : int
-        Number of ions, and of solutes among them.
-    """
+    """Warren-Cowley parameters of a random alloy after its evaporation."""
 
     reconstructed: Estimated
     shuffled: Estimated
@@ -80,12 +68,6 @@ def warren_cowley(positions: ArrayLike, solute: ArrayLike, shell: float = SHELL)
         Which ions are solutes, shape (n,).
     shell : float
         Largest distance of neighbours [nm].
-
-    Returns
-    -------
-    float
-        0 for a random alloy; negative if solutes have more solutes as neighbours, 1 if they have none. NaN without
-        neighbours.
 
     Notes
     -----
