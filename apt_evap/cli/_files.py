@@ -163,8 +163,9 @@ def of_element(hits: Hits, options: argparse.Namespace, computed: bool) -> Hits:
         say("note", f"all ions are used: {error}")
         return hits
     peaks = "; ".join(
-        f"{peak.name} at {', '.join(f'{low:.4g} to {high:.4g}' for low, high in peak.intervals)} Da"
-        for peak in named.peaks
+        f"{ion.name} at {', '.join(f'{low:.4g} to {high:.4g}' for low, high in ion.intervals)} Da"
+        for ion in named.ions
+        if ion.formula == element and ion.intervals
     )
     number = int(np.count_nonzero(inside))
     say(
