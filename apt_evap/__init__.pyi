@@ -6,6 +6,7 @@ from . import evaporation as evaporation
 from . import fit as fit
 from . import io as io
 from . import maps as maps
+from . import measures as measures
 from . import plot as plot
 from . import reconstruction as reconstruction
 from . import simulation as simulation

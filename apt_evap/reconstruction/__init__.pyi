@@ -5,8 +5,6 @@ from .calibration import distribution_map as distribution_map
 from .consistency import checks as checks
 from .constants import run_constants as run_constants
 from .evolving import EvolvingReconstruction as EvolvingReconstruction
-from .interface import interface_profile as interface_profile
-from .interface import segregation_profile as segregation_profile
 from .origins import origin_table as origin_table
 from .precipitate import precipitate_errors as precipitate_errors
 from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
