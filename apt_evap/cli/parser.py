@@ -54,6 +54,7 @@ COMMANDS = {
     "info": "summarise a file",
     "spectrum": "draw and name the peaks of the mass spectrum of measured ions",
     "composition": "composition of measured ions with its errors, and what is unexplained",
+    "planes": "spacing and orientation of lattice planes in reconstructed ions",
     "index": "which crystal direction is where on a measured map",
     "start": "settings file for a simulation of a measured specimen",
     "twin": "from a measured file to a simulation of its specimen, a fit and a report",
