@@ -12,9 +12,9 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
+from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.specimen_surface import surface_atoms
-from apt_evap.plot.limits import color_limits, common_limits
 
 pytest.importorskip("bokeh")
 
@@ -38,7 +38,7 @@ SECONDS = 60  # until a test gives up: the machine may be busy
 
 @pytest.fixture(scope="module")
 def run(small_tip, made_once):
-    return made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    return made_once(small_tip, 2000, seed=1, **ROUGH)
 
 
 @pytest.fixture(scope="module")
