@@ -2,6 +2,7 @@
 from ._figure import new_figure as new_figure
 from .candidates import indexing as indexing
 from .charges import charge_states as charge_states
+from .correlations import correlation as correlation
 from .folds import folded_maps as folded_maps
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
