@@ -41,9 +41,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from dataclasses import replace
+
     from apt_evap import plot
     from apt_evap._common.files import FileError, check_path
-    from apt_evap.cli._files import read, select
+    from apt_evap.cli._files import file_of, read
     from apt_evap.detection.hits import Hits
     from apt_evap.io.formats import read_ranges
     from apt_evap.io.rrng import write_rrng
@@ -61,15 +63,16 @@ def execute(options: argparse.Namespace) -> int:
         check_output(saved, lambda path: True, options.force)
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
-    # drawn, not a selection of ions
-    ranges, options.ranges = None if options.ranges is None else read_ranges(options.ranges), None
+    ranges = None if options.ranges is None else read_ranges(options.ranges)
     hits = read(options)
     if not isinstance(hits, Hits):
         raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
     if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
         raise ValueError(f"--distance is missing: {options.file!r} has no masses, and times of flight need it [mm]")
     elements = None if options.element is None else options.element.split(",")
-    result = spectrum(select(hits, options), elements, distance=options.distance, time_zero=options.time_zero)
+    # ranges are drawn, no selection of ions; flight length and time zero are fitted
+    selection = replace(file_of(options), ranges=None, distance=None).select(hits)
+    result = spectrum(selection, elements, distance=options.distance, time_zero=options.time_zero)
     tell(options, f"{result}")
     if result.flight is not None and result.flight.peaks:
         fit = result.flight
