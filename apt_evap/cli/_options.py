@@ -35,7 +35,7 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     )
     selection.add_argument("--circle", type=_circle, metavar="R[,X,Y]", help="radius and centre on the detector [mm]")
     selection.add_argument("--box", type=_box, metavar="X0,X1,Y0,Y1", help="rectangle on the detector [mm]")
-    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env: ranges of mass, for --species")
+    selection.add_argument("--ranges", metavar="FILE.rrng", help="or .rng, .env, .xrng: ranges of mass, for --species")
     selection.add_argument(
         "--species", metavar="NAME[,NAME]", help="ions of these names, such as Si: in --ranges, or of a run"
     )

@@ -8,8 +8,8 @@ import lzma
 import math
 import re
 import zlib
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, check_path, open_for_reading, read_small_file
 from apt_evap._common.types import AnyPath, Floats
+from apt_evap.specimen.nuclides import ISOTOPES
 from apt_evap.warnings import DataWarning, warn
 
 _MAX_BYTES = 1 << 22
@@ -28,6 +29,7 @@ SYMBOLS = tuple(
 )
 """Chemical symbols in the order of the atomic numbers."""
 ELEMENTS = frozenset(SYMBOLS)
+_NAMED = {symbol: number for number, symbol in enumerate(SYMBOLS, 1)} | {"D": 1}  # in names of ions
 
 
 def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
@@ -193,10 +195,65 @@ def number(text: str, what: str, where: str) -> float:
 
 
 def count(text: str, what: str, where: str) -> int:
-    """Return an integer of at most six digits; a FileError names the place otherwise."""
-    if not re.fullmatch(r"[0-9]{1,6}", text):
+    """Return an integer of at most six digits, also written as "2.000"; a FileError names the place otherwise."""
+    if not re.fullmatch(r"[0-9]{1,6}([.,]0*)?", text):
         raise FileError(f"{where}: expected {what}, got {text!r:.60}")
-    return int(text)
+    return int(re.split("[.,]", text)[0])
+
+
+def check_bounds(low: float, high: float, where: str) -> tuple[float, float]:
+    """Return the two bounds of a range [Da], 0 <= low < high; a FileError names the place otherwise."""
+    if low < 0:
+        raise FileError(f"{where}: expected two bounds >= 0 [Da], got {low:g} and {high:g}")
+    if not low < high:
+        raise FileError(f"{where}: expected two bounds [Da], the lower one first, got {low:g} and {high:g}")
+    return low, high
+
+
+class OddLines:
+    """Lines of a file that cannot be read: they are left out, and one warning names them.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    """
+
+    def __init__(self, path: AnyPath) -> None:
+        self._path, self._problems = repr(str(path)), dict[int, str]()
+
+    def where(self, line: int) -> str:
+        """File and line, for the message of an error."""
+        return f"{self._path}, line {line}"
+
+    @contextmanager
+    def leave_out(self, line: int, instead: str = "left out") -> Iterator[None]:
+        """Keep the FileError of a line, with what is done instead."""
+        try:
+            yield
+        except FileError as error:
+            stated = re.match(re.escape(self._path) + ", line ([0-9]+): ", str(error))  # maybe one after it
+            problem = str(error)[stated.end() :] if stated else str(error)
+            self.add(int(stated[1]) if stated else line, problem, instead)
+
+    def add(self, line: int, problem: str, instead: str = "left out") -> None:
+        """Keep a problem of a line, and what is done instead."""
+        self._problems.setdefault(line, f"{problem}: {instead}")
+
+    def report(self, rows: int, nothing: str) -> None:
+        """Warn of these lines; raise a FileError if no row is left, of the first of them or that there is nothing."""
+        problems = sorted(self._problems.items())
+        if not rows:
+            reason = f", line {problems[0][0]}: {problems[0][1]}; {nothing}" if problems else f" {nothing}"
+            raise FileError(f"{self._path}{reason:.400}")
+        if problems:
+            text = "; ".join(f"line {line}: {problem}" for line, problem in problems[:_SHOWN])
+            others = ", ".join(str(line) for line, _ in problems[_SHOWN : 4 * _SHOWN])
+            more = ", ..." if len(problems) > 4 * _SHOWN else ""
+            warn(f"{self._path}, {text}{f'; also lines {others}{more}' if others else ''}", DataWarning)
+
+
+_SHOWN = 4  # odd lines in full
 
 
 def colour(parts: list[str], where: str) -> str:
@@ -205,20 +262,129 @@ def colour(parts: list[str], where: str) -> str:
     return "#" + "".join(f"{round(255 * min(max(value, 0.0), 1.0)):02X}" for value in values)
 
 
-def formula(atoms: dict[str, int]) -> str:
-    """Formula of a molecular ion, such as "CrO2"."""
-    return "".join(element + (str(n) if n > 1 else "") for element, n in atoms.items())
+def formula(species: Mapping[str, int]) -> str:
+    """Formula of a molecular ion, such as "CrO2"; a name that ends with a digit is repeated: "N15N15"."""
+    text = ""
+    for name, n in species.items():
+        if name[-1].isdigit():
+            text += name * n if n < 4 else f"({name}){n}"
+        else:
+            text += name + (str(n) if n > 1 else "")
+    return text
 
 
 def atoms_of(name: str) -> dict[str, int]:
-    """Number of atoms of each element in a formula such as "Mn2O"; an empty dict for any other name."""
-    parts = re.findall(r"([A-Z][a-z]?)([0-9]{0,2})", name)  # U235 is an isotope
-    if "".join(map("".join, parts)) != name or not all(element in ELEMENTS for element, _ in parts):
-        return {}
+    """Number of atoms of each element in a formula such as "Mn2O"; an empty dict for any other name.
+
+    Numbers are those of atoms, never those of isotopes: see `composition_of` for a range, whose mass decides.
+    """
     atoms: dict[str, int] = {}
-    for element, n in parts:
-        atoms[element] = atoms.get(element, 0) + int(n or 1)
+    for element, digits in _parts(name):
+        atoms[element] = atoms.get(element, 0) + int(digits or 1)
     return {element: n for element, n in atoms.items() if n}
+
+
+def _parts(name):
+    """Elements of a formula, each with the digits after it; none for any other name."""
+    parts = re.findall(r"([A-Z][a-z]?)([0-9]{0,3})", name)
+    is_formula = "".join(map("".join, parts)) == name and all(element in _NAMED for element, _ in parts)
+    return parts if is_formula else []
+
+
+def isotope_mass(element: str, number: int) -> float | None:
+    """Mass of an isotope of an element [Da]; None if no isotope can have this mass number."""
+    natural = [mass for mass, _ in ISOTOPES.get(element, ()) if round(mass) == number]
+    z = _NAMED[element]
+    return natural[0] if natural else float(number) if element != "D" and z <= number <= 3 * z else None
+
+
+def isotope_masses(name: str) -> list[float]:
+    """Masses of the natural isotopes of an element, or of an isotope such as "Ni58" [Da]."""
+    element, digits = (*_parts(name), ("", ""))[0]
+    if element + digits != name:
+        return []
+    return [mass for mass, _ in ISOTOPES.get(element, ()) if not digits or round(mass) == int(digits)]
+
+
+def composition_of(species: Mapping[str, int], low: float, high: float) -> tuple[dict[str, int], str]:
+    """Number of atoms of each element in the ion of a range, whose species may be molecules or isotopes; its formula.
+
+    "Ti46" is one atom and "C60" sixty: the number after an element is that of an isotope or of atoms, whichever gives
+    a mass within the range for a charge from 1 to 4. If both or neither do, it is that of a natural isotope, but that
+    of atoms after hydrogen.
+
+    Parameters
+    ----------
+    species : mapping of str to int
+        Number of each species in the ion.
+    low, high : float
+        Bounds of the range [Da].
+
+    Returns
+    -------
+    atoms : dict of str to int
+        Names that are not formulas stay.
+    formula : str
+        With the isotopes, such as "Ni58O".
+    """
+    parts = []  # of all species: element, digits, number of the species
+    certain = set()  # parts that are isotopes, such as "28Si"
+    for name, n in species.items():
+        first = re.fullmatch(r"([0-9]{1,3})([A-Z][a-z]?)", name)
+        if first and first[2] in _NAMED and isotope_mass(first[2], int(first[1])):
+            certain.add(len(parts))
+            parts.append((first[2], first[1], n))
+        else:
+            parts += [(element, digits, n) for element, digits in _parts(name)] or [(name, "", n)]
+    # parts whose number may be that of an isotope
+    doubtful = [
+        k
+        for k, (element, digits, _) in enumerate(parts)
+        if digits and k not in certain and isotope_mass(element, int(digits))
+    ]
+    if len(doubtful) > _MOST_DOUBTFUL:
+        doubtful = []
+    choices = []
+    for bits in range(1 << len(doubtful)):
+        isotopes = certain | {k for at, k in enumerate(doubtful) if bits >> at & 1}
+        unusual = sum((k in isotopes) != _is_usual_isotope(*parts[k][:2]) for k in doubtful)
+        choices.append((not _fits(parts, isotopes, low, high), unusual, bits, isotopes))
+    isotopes = min(choices)[3]
+    atoms: dict[str, int] = {}
+    named: dict[str, int] = {}
+    for k, (element, digits, n) in enumerate(parts):
+        label = element + digits if k in isotopes else element
+        n *= 1 if k in isotopes else int(digits or 1)
+        if n:
+            atoms[element] = atoms.get(element, 0) + n
+            named[label] = named.get(label, 0) + n
+    return atoms, formula(named)
+
+
+_MOST_DOUBTFUL = 8  # numbers of one range that may be those of isotopes: all 256 choices are compared
+_CHARGES = range(1, 5)
+_NEAR = 0.1  # [Da]: masses of isotopes differ from integers by up to 0.1
+
+
+def _is_usual_isotope(element, digits):
+    natural = [round(mass) for mass, _ in ISOTOPES.get(element, ())]
+    return element != "H" and (int(digits) in natural or not natural)
+
+
+def _fits(parts, isotopes, low, high):
+    """Whether an ion of these parts, some of which are isotopes, may have a mass over charge state in the range."""
+    lightest = heaviest = 0.0
+    for k, (name, digits, n) in enumerate(parts):
+        if k in isotopes:
+            masses = [isotope_mass(name, int(digits))]
+        elif name in _NAMED:
+            n *= int(digits or 1)
+            z = _NAMED[name]
+            masses = [2.014] if name == "D" else [mass for mass, _ in ISOTOPES.get(name, ())] or [2 * z, 3 * z]
+        else:
+            return False
+        lightest, heaviest = lightest + n * min(masses), heaviest + n * max(masses)
+    return any(lightest / charge - _NEAR < high and heaviest / charge + _NEAR > low for charge in _CHARGES)
 
 
 def species_name(word: str, known: Collection[str], where: str) -> str:
@@ -255,12 +421,3 @@ def species_name(word: str, known: Collection[str], where: str) -> str:
     if similar:
         warn(f"{where}: {word!r} may be any of {', '.join(similar)}, it is read as {name}", DataWarning)
     return name
-
-
-def atoms_in(species: Mapping[str, int]) -> dict[str, int]:
-    """Number of atoms of each element in an ion, whose species may be molecules; other names stay."""
-    elements: dict[str, int] = {}
-    for name, n in species.items():
-        for element, count in (atoms_of(name) or {name: 1}).items():
-            elements[element] = elements.get(element, 0) + n * count
-    return elements

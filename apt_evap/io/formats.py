@@ -34,6 +34,7 @@ from apt_evap.io.tapsim import SIGNATURE as TAPSIM
 from apt_evap.io.tapsim import WRITTEN as TAPSIM_COLUMNS
 from apt_evap.io.tapsim import read_tapsim, write_tapsim
 from apt_evap.io.vtp import write_vtp
+from apt_evap.io.xrng import read_xrng
 from apt_evap.io.xyz import write_xyz
 from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import DataWarning, warn
@@ -101,7 +102,7 @@ FORMATS = (
     Format(".tapsim", TAPSIM, read_tapsim, write_tapsim, keeps=lambda name, _: name in TAPSIM_COLUMNS),
 )
 
-RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env}
+RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env, ".xrng": read_xrng}
 """Readers of files of mass ranges, by suffix."""
 
 _CAMECA = "raw files of CAMECA are not documented in public: export .epos or .apt from AP Suite"
@@ -286,7 +287,7 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     Parameters
     ----------
     path : str or path-like
-        The file: .rrng, .rng or .env. A file with another suffix is read as .rrng.
+        The file: .rrng, .rng, .env or .xrng. A file with another suffix is read as .xrng if it is XML, else as .rrng.
     format : str, optional
         Suffix of the format, such as ".rng", for any name of the file.
 
@@ -298,14 +299,28 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
     Raises
     ------
     FileError
-        If the file is missing or unreadable, has no ranges, or contains an invalid line, or the format is unknown.
+        If the file is missing or unreadable, or has no ranges, or the format is unknown.
+
+    Warns
+    -----
+    DataWarning
+        Of lines that cannot be read, with their numbers: they are left out.
     """
     suffix = without_compression(path).suffix.lower()
     if format is not None:
         suffix = "." + check_kind(format, "format", str, "a suffix such as '.rng'").lower().lstrip(".")
         if suffix not in RANGE_FORMATS:
             raise FileError(f"format of {str(path)!r} must be one of {', '.join(RANGE_FORMATS)}, got format={format!r}")
-    return RANGE_FORMATS.get(suffix, read_rrng)(path)
+    if suffix in RANGE_FORMATS:
+        return RANGE_FORMATS[suffix](path)
+    known = f"expected one of {', '.join(RANGE_FORMATS)}, got suffix {suffix!r}"
+    head = read_head(path, 64).lstrip()
+    if head.startswith(_HDF5.lstrip()):
+        raise FileError(f"{str(path)!r} is an HDF5 file, no file of mass ranges: {known}")
+    try:
+        return read_xrng(path) if head.startswith(b"<") else read_rrng(path)
+    except FileError as error:
+        raise FileError(f"{error}; {known}") from error
 
 
 def format_of(path: AnyPath, format: str | None = None) -> Format:

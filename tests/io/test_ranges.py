@@ -41,10 +41,15 @@ def test_the_extension_may_be_missing_or_have_its_own_ranges(save):
 
 
 def test_a_column_that_is_a_molecule_or_no_element(save):
-    text = RNG.split("\n\n")[0].replace("Si 0.80", "SiO2 0.80").replace(" Cr Si O", " Cr SiO2 U235")
+    text = (
+        RNG.split("\n\n")[0]
+        .replace("Si 0.80", "SiO2 0.80")
+        .replace("O 0,0", "U235 0,0")
+        .replace(" Cr Si O", " Cr SiO2 U235")
+    )
     ranges = read_ranges(save(text))
     assert ranges.names[1] == "SiO2" and ranges.composition[1] == {"Si": 1, "O": 2}
-    assert ranges.composition[2] == {"Cr": 1, "U235": 1}
+    assert ranges.composition[2] == {"Cr": 1, "U": 1}
 
 
 def test_decimal_commas_comments_and_windows(save):
@@ -53,7 +58,7 @@ def test_decimal_commas_comments_and_windows(save):
 
 
 def test_rng_that_is_odd(save):
-    with pytest.warns(DataWarning, match=r"a\.rng' states 5 ranges but contains 4"):
+    with pytest.warns(DataWarning, match=r"a\.rng', line 1: states 5 ranges but contains 4"):
         assert len(read_ranges(save(RNG.replace("3 4", "3 5", 1)))) == 4
     with pytest.warns(DataWarning, match="1 range without species"):
         assert len(read_ranges(save(RNG.replace(". 13.8 14.2 0 1 0", ". 13.8 14.2 0 0 0")))) == 3
@@ -65,20 +70,32 @@ def test_rng_that_is_odd(save):
         ("3 4", "3 4 5", "line 1: expected the numbers of species and of ranges, got '3 4 5'"),
         ("3 4", "3 many", "line 1: expected the numbers of species and of ranges, got 'many'"),
         ("3 4", "90 4", "expected 90 species and then a line of dashes"),
-        ("Cr 1.00 0.50", "Cr red 0.50", "line 3: expected a part of a colour from 0 to 1, got 'red'"),
-        ("Cr 1.00 0.50 0.00", "Cr", "line 3: expected a species and its colour, got 'Cr'"),
         ("--------------- Cr", "Cr", "line 8: expected a line of dashes"),
-        ("- Cr Si O", "- Cr Si", "line 8: expected 3 species after the dashes, got 2"),
-        ("25.9 26.3 1 0 0", "25.9 26.3 1 0", "line 9: expected two bounds and 3 numbers of atoms, got 4 values"),
-        ("25.9 26.3", "26.3 25.9", "line 9: expected two bounds .Da., the lower one first, got 26.3 and 25.9"),
-        ("25.9 26.3", "nan 26.3", "line 9: expected a bound .Da., got 'nan'"),
-        ("25.9 26.3 1", "25.9 26.3 -1", "line 9: expected a number of atoms, got '-1'"),
         ("1 1\nCrO2\n", "", "line 15: expected the numbers of species and of ranges"),
     ],
 )
 def test_rng_that_is_wrong(save, old, new, message):
     with pytest.raises(FileError, match=rf"a\.rng'.*{message}"):
         read_ranges(save(RNG.replace(old, new, 1)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message", "names"),
+    [
+        ("Cr 1.00 0.50", "Cr red 0.50", "line 3: expected a part of a colour from 0 to 1, got 'red'", "Cr Si CrO CrO2"),
+        ("Cr 1.00 0.50 0.00", "Cr", "line 3: expected a species and its colour, got 'Cr'", "Cr Si CrO CrO2"),
+        ("- Cr Si O", "- Cr Si", "line 8: expected 3 species after the dashes, got 2", "Cr Si CrO CrO2"),
+        ("- Cr Si O", "- Cr Qq O", "line 8: 'Qq' is not in the list of species: read as Si", "Cr Si CrO CrO2"),
+        ("25.9 26.3 1 0 0", "25.9 26.3 1 0", "line 9: expected two bounds and 3 numbers of atoms", "Si CrO CrO2"),
+        ("25.9 26.3", "26.3 25.9", "line 9: .* lower one first, got 26.3 and 25.9: left out", "Si CrO CrO2"),
+        ("25.9 26.3", "nan 26.3", "line 9: expected a bound .Da., got 'nan': left out", "Si CrO CrO2"),
+        ("25.9 26.3 1", "25.9 26.3 -1", "line 9: expected a number of atoms, got '-1'", "Si CrO CrO2"),
+        ("--- polyatomic extension\n", "", "line 14: expected a range, got '1 1'", "Cr Si CrO CrO2"),
+    ],
+)
+def test_odd_lines_of_an_rng(save, old, new, message, names):
+    with pytest.warns(DataWarning, match=rf"a\.rng', .*{message}"):
+        assert " ".join(read_ranges(save(RNG.replace(old, new, 1))).names) == names
 
 
 def test_every_value_of_an_env(save):
@@ -97,10 +114,6 @@ def test_every_value_of_an_env(save):
         ("3 3\n", "\n", "no line with the numbers of species and of ranges"),
         ("3 3\n", "3 0\n", r"line 5: expected 3 species and 0 ranges \(at least one\)"),
         ("3 3\n", "3 90\n", "line 5: expected 3 species and 90 ranges"),
-        ("Mn\t0.0\t0.5\t1.0", "Mn\t0.0", "line 7: expected a species and its colour"),
-        ("27,33\t27,95", "27,95\t27,33", "line 11: expected two bounds"),
-        ("27,33\t27,95\t11.66\t1.0", "27,33", "line 11: expected a species and two bounds"),
-        ("11.66", "large", "line 11: expected a volume"),
     ],
 )
 def test_env_that_is_wrong(save, old, new, message):
@@ -108,9 +121,25 @@ def test_env_that_is_wrong(save, old, new, message):
         read_ranges(save(ENV.replace(old, new, 1), "a.env"))
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message", "names"),
+    [
+        ("Mn\t0.0\t0.5\t1.0", "Mn\t0.0", "line 7: expected a species and its colour", "Mn Mn2O Hyd"),
+        ("27,33\t27,95", "27,95\t27,33", "line 11: expected two bounds", "Mn2O Hyd"),
+        ("27,33\t27,95\t11.66\t1.0", "27,33", "line 11: expected a species and two bounds", "Mn2O Hyd"),
+        ("11.66", "large", "line 11: expected a volume", "Mn2O Hyd"),
+        ("3 3\n", "3 2\n", "line 5: states 2 ranges but contains 3: all are read", "Mn Mn2O Hyd"),
+        ("Mn2O\t62", "Mn9Q\t62", "line 12: 'Mn9Q' is not in the list of species", "Mn Mn9Q Hyd"),
+    ],
+)
+def test_odd_lines_of_an_env(save, old, new, message, names):
+    with pytest.warns(DataWarning, match=rf"a\.env', .*{message}"):
+        assert " ".join(read_ranges(save(ENV.replace(old, new, 1), "a.env")).names) == names
+
+
 def test_the_format_may_be_given(save):
     assert read_ranges(save(RNG, "ranges.txt"), format="rng").names[0] == "Cr"
-    with pytest.raises(FileError, match=r"must be one of \.rrng, \.rng, \.env, got format='pos'"):
+    with pytest.raises(FileError, match=r"must be one of \.rrng, \.rng, \.env, \.xrng, got format='pos'"):
         read_ranges(save(RNG), format="pos")
     with pytest.raises(FileError, match="no lines Range1"):
         read_ranges(save(RNG, "a.rrng"))
@@ -132,3 +161,11 @@ def test_repeated_ranges_of_an_rng_are_interpreted_once(save, monkeypatch):
     assert len(interpreted) == 2
     with pytest.warns(DataWarning, match="states 2000 ranges but contains 1999"):
         read_ranges(save(text))
+
+
+def test_a_file_that_is_something_else_is_not_said_to_lack_lines_alone(save, tmp_path):
+    with pytest.raises(FileError, match=r"expected one of \.rrng, \.rng, \.env, \.xrng, got suffix '\.txt'"):
+        read_ranges(save("Si 27.9 28.2\n", "a.fig.txt"))
+    (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    with pytest.raises(FileError, match=r"a\.h5' is an HDF5 file, no file of mass ranges: expected one of \.rrng"):
+        read_ranges(tmp_path / "a.h5")
