@@ -37,6 +37,7 @@ _THUMBNAILS = {
     "reconstruct": ("articles/small_specimens/superalloy.png", (0.0, 0.54, 0.47, 1.0)),
     "correct_distortion": ("articles/origins/origins.png", (0.0, 0.0, 0.33, 1.0)),
     "own_structure": ("docs/howto/own_structure.png", (0.0, 0.0, 0.62, 1.0)),
+    "examples": ("docs/howto/examples/gamma_prime.png", (0.0, 0.0, 0.56, 0.86)),
     "precipitate_or_boundary": ("docs/howto/precipitate_or_boundary.png", (0.335, 0.04, 1.0, 0.5)),
     "visibility": ("articles/find_the_precipitate/find_the_precipitate.png", (0.34, 0.0, 1.0, 0.485)),
     "real_units": ("articles/microscope/course.png", (0.0, 0.0, 1.0, 1.0)),

@@ -42,10 +42,10 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     return group
 
 
-def add_indexing(parser: argparse.ArgumentParser) -> None:
+def add_indexing(parser: argparse.ArgumentParser, required: bool = True) -> None:
     """Add options of the crystal on a measured map."""
     group = parser.add_argument_group("crystal")
-    group.add_argument("--element", metavar="NAME", required=True, help=f"the crystal: {MATERIAL_HELP}")
+    group.add_argument("--element", metavar="NAME", required=required, help=f"the crystal: {MATERIAL_HELP}")
     add_flight(group)
     group.add_argument(
         "--all-ions",

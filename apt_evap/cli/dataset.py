@@ -11,17 +11,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
         "Run the simulations of a study file, record their ions as an instrument would, and write them\n"
-        "with the truth: for machine learning and statistics. Time and size are foretold. The command can be killed\n"
+        "with the truth: for machine learning and statistics. Time and size are estimated. The command can be killed\n"
         "and started again at any time; equal studies give equal bytes. For the folder of a data set, verify it."
     )
     parser.epilog = (
         "example:\n"
-        "  apt-evap examples --to FOLDER                   writes dataset.toml: ten tips, half a minute\n"
+        "  apt-evap dataset dataset --plan                 the shipped example dataset.toml: ten tips\n"
         "  apt-evap dataset study.toml --plan              runs, examples, hours, size; runs nothing\n"
         "  apt-evap dataset study.toml -o set --workers 2  make the set, or finish it\n"
         "  apt-evap dataset set                            verify its checksums"
     )
-    parser.add_argument("study", metavar="STUDY.toml", help="study file with a table [dataset], or a data set")
+    parser.add_argument(
+        "study",
+        metavar="STUDY.toml",
+        help="study file with a table [dataset], the name of a shipped example, or a data set",
+    )
     parser.add_argument("-o", "--output", metavar="FOLDER", help="default: name of the study with _set")
     parser.add_argument("--plan", action="store_true", help="only estimate time and size")
     parser.add_argument("--workers", type=integer_type(1), default=1, metavar="N", help="processes; default: 1")
@@ -33,11 +37,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.cli._shipped import settings_file
     from apt_evap.config.cost_estimate import hours_text
     from apt_evap.studies.dataset.making import make_dataset, plan_dataset
     from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
 
-    path = Path(options.study)
+    path = Path(settings_file(options, options.study))
     if path.is_dir() and (path / ABOUT).exists():
         content = verify_dataset(path)
         tell(options, f"{path}: all files are as in its checksums")

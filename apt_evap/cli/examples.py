@@ -2,21 +2,20 @@
 
 import argparse
 import ast
-from pathlib import Path
 
 from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
-
-# in a wheel inside the package, in the repository beside it
-_PACKAGE = Path(__file__).parents[1]
-_PLACES = (_PACKAGE / "examples", _PACKAGE.parent / "examples")
-_SUFFIXES = (".py", ".toml")
+from apt_evap.cli._shipped import shipped
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = "List the examples of the package: settings files and Python scripts. With --to, copy them."
-    parser.epilog = "example:\n  apt-evap examples --to apt_examples\n  apt-evap run apt_examples/particle.toml"
+    parser.epilog = (
+        "example:\n"
+        "  apt-evap run precipitate               an example by its name: copies precipitate.toml to this folder\n"
+        "  apt-evap examples --to apt_examples    all of them"
+    )
     parser.add_argument("--to", metavar="FOLDER", help="copy the examples to this folder")
     parser.add_argument("--force", action="store_true", help="overwrite files that differ from the examples")
     add_speech(parser)
@@ -26,12 +25,14 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap._common.files import FileError, check_path, replace_file
 
-    examples = {path.name: path.read_bytes() for path in _paths()}
+    examples = {path.name: path.read_bytes() for path in shipped()}
     titles = {name: _title(name, content.decode()) for name, content in examples.items()}
     if options.to is None:
         for name, title in titles.items():
             tell(options, f"{name:<{max(map(len, titles))}}  {title}")
-        tell(options, "\napt-evap examples --to FOLDER copies these files")
+        tell(
+            options, "\napt-evap run NAME runs the example NAME.toml; apt-evap examples --to FOLDER copies these files"
+        )
         tell_json(options, {"examples": titles})
         return 0
     folder = check_path(options.to)
@@ -48,16 +49,6 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"wrote {len(examples)} files to {folder}")
     tell_json(options, {"folder": str(folder), "files": list(examples)})
     return 0
-
-
-def _paths():
-    from apt_evap._common.files import FileError
-
-    for place in _PLACES:
-        paths = sorted(path for path in place.glob("*") if path.suffix in _SUFFIXES)
-        if paths:
-            return paths
-    raise FileError(f"the examples are not in {str(_PLACES[0])!r}: reinstall the package")
 
 
 def _check_own(path, content):

@@ -31,16 +31,16 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap spectrum R5083.epos --save R5083.rrng     mass spectrum: peaks, background, ranges
   apt-evap index R5083.epos --element Ni             which crystal direction is where on the map
   apt-evap twin R5083.epos --element Ni              all of this: index, simulate, register, fit, report
+  apt-evap paper                                     figures 2 to 7 of the paper, and what agrees with it
   apt-evap compare ni111.h5 R5083.epos -o study      fit the emission energies to the measured map
   apt-evap export ni111.h5 --real-units -o ni111.epos
                                                      ions as an instrument would write them
   apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
                                                      positions in the specimen from the hits
-  apt-evap examples --to FOLDER                      settings and scripts to start from: of a tip, a precipitate, a
-                                                     grain boundary, `visible`, `sweep` and `dataset`
+  apt-evap run precipitate                           an example by its name; `apt-evap examples` lists all
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
-  apt-evap visible visible.toml                      would this precipitate be found?
+  apt-evap visible visible                           would this precipitate be found?
   apt-evap dataset study.toml -o set                 a data set with the truth of every ion
   apt-evap COMMAND --help                            all arguments of a command, with examples
 """
@@ -53,6 +53,7 @@ COMMANDS = {
     "index": "which crystal direction is where on a measured map",
     "start": "settings file for a simulation of a measured specimen",
     "twin": "from a measured file to a simulation of its specimen, a fit and a report",
+    "paper": "figures 2 to 7 of the paper of the model, of twins or of a measured map",
     "compare": "fit the emission energies of a run to a measured map",
     "export": "write ions as .epos, .pos, .nxs, .csv, .tapsim, .xyz or .vtp",
     "reconstruct": "reconstruct the positions of ions from their hits",

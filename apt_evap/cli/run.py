@@ -19,13 +19,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "example:\n"
-        "  apt-evap examples --to FOLDER                      writes the settings of a pure tip (ni111.toml), of a\n"
-        "                                                     precipitate and of a grain boundary\n"
-        "  apt-evap run FOLDER/ni111.toml -o ni.h5 --ions 5000\n"
-        "  apt-evap run FOLDER/particle.toml                  half a minute\n"
-        "  apt-evap run FOLDER/grain_boundary.toml            half a minute"
+        "  apt-evap run mine.toml -o ni.h5 --ions 5000\n"
+        "  apt-evap run precipitate                 a shipped example: copies precipitate.toml to this folder\n"
+        "shipped examples, less than a minute of one processor each: ni111.toml (a pure tip), precipitate.toml,\n"
+        "core_shell.toml, gamma_prime.toml, gp_zone.toml, multilayer.toml, multilayer_across.toml, grain_boundary.toml"
     )
-    parser.add_argument("config", metavar="CONFIG.toml")
+    parser.add_argument("config", metavar="CONFIG.toml", help="settings file, or the name of a shipped example")
     parser.add_argument("-o", "--output", metavar="RUN.h5", help="default: output in the file, or its name with .h5")
     parser.add_argument(
         "--ions", type=integer_type(1), metavar="N", help="number of atoms to evaporate; default: ions in the file"
@@ -50,10 +49,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap.cli._progress import run_progress
+    from apt_evap.cli._shipped import settings_file
     from apt_evap.workflows.simulate_file import simulate
 
     simulated = simulate(
-        options.config,
+        settings_file(options, options.config),
         options.output,
         ions=options.ions,
         seed=options.seed,

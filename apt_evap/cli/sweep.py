@@ -16,7 +16,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "example:\n"
-        "  apt-evap examples --to FOLDER                           writes sweep.toml: four tips, half a minute\n"
+        "  apt-evap sweep plan sweep                               the shipped example sweep.toml: four tips\n"
         "  apt-evap sweep plan study.toml                          folders, memory and hours; runs nothing\n"
         "  apt-evap sweep work study.toml --workers 4              on this machine\n"
         "  apt-evap sweep work study.toml --point 3                as one task of a cluster\n"
@@ -27,7 +27,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
     def add(name, text, **options):
         action = actions.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.", **options, **SHAPE)
-        action.add_argument("study", metavar="STUDY.toml", help="study file, or the folder of its sweep")
+        action.add_argument(
+            "study", metavar="STUDY.toml", help="study file, its folder, or the name of a shipped example"
+        )
         return action
 
     add_speech(add("plan", "make the folder of a sweep, and estimate memory and hours; nothing is run"))
@@ -44,7 +46,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     work.add_argument("--address", metavar="TCP", help="address of the scheduler of Dask")
     work.add_argument("--retry", action="store_true", help="also try failed points again")
     add_speech(work)
-    add("status", "show the states of all points").add_argument("--json", action="store_true", help="as JSON")
+    add_speech(add("status", "show the states of all points"))
     gather = add("collect", "collect the finished points: table, maps, report, and the fit to a measured map")
     gather.add_argument("--maps", metavar="MAPS.h5", help="default: maps.h5 in the folder of the sweep")
     gather.add_argument("--bins", type=integer_type(1, MAX_BINS), metavar="N", help="default: bins in [maps], or 128")
@@ -54,6 +56,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.cli._shipped import settings_file
+
+    options.study = settings_file(options, options.study)
     return _ACTIONS[options.action](options)
 
 
@@ -126,13 +131,13 @@ def _status(options):
 
     content = sweep_status(open_sweep(options.study))
     if options.json:
-        put(json.dumps(content, allow_nan=False))
+        tell_json(options, content)
         return 0
     for row in content["table"]:
         values = ", ".join(f"{path} = {json.dumps(value)}" for path, value in row["values"].items())
         message = f"  {row['message']}" if row["message"] else ""
-        put(f"{row['key']}  {row['state']:7}  {row['ions']:,} of {row['n_ions']:,} ions  {values}{message}")
-    _tell_counts(argparse.Namespace(quiet=False, json=False), content)
+        tell(options, f"{row['key']}  {row['state']:7}  {row['ions']:,} of {row['n_ions']:,} ions  {values}{message}")
+    _tell_counts(options, content)
     return 0
 
 

@@ -16,20 +16,24 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = (
         "example:\n"
-        "  apt-evap examples --to FOLDER              writes visible.toml and its analysis visible_pairs.py\n"
-        "  apt-evap visible FOLDER/visible.toml       a minute at the first call\n"
+        "  apt-evap visible visible                   the shipped example; copies visible.toml and visible_pairs.py\n"
         "  apt-evap visible mine.toml --json"
     )
-    parser.add_argument("config", metavar="FILE.toml", help="settings of a simulation, with a table [visibility]")
+    parser.add_argument(
+        "config",
+        metavar="FILE.toml",
+        help="settings of a simulation, with a table [visibility], or the name of a shipped example",
+    )
     parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
     add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from apt_evap.cli._shipped import settings_file
     from apt_evap.studies.visibility.visibility_file import visibility_of_file
 
-    result = visibility_of_file(options.config, n_threads=options.threads)
+    result = visibility_of_file(settings_file(options, options.config), n_threads=options.threads)
     probability = result.probability
     tell(options, f"probability to be found: {probability.value:.2f} ± {probability.error:.2f}")
     for name, number in (("N50", result.n50), ("N95", result.n95)):

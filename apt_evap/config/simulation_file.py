@@ -22,7 +22,7 @@ from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import field_of_view
-from apt_evap.emission.perturbations import Perturbation
+from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
@@ -132,6 +132,14 @@ class Config:
         if self.output is not None and not (isinstance(self.output, str) and self.output):
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
+        if self.real_units is not None and not self.responses:
+            for (
+                perturbation
+            ) in self.emissions:  # its energies are those of an experiment, its flight would be at 1000 V
+                if perturbation != Unperturbed():
+                    raise ValueError(
+                        f"[simulation] responses must be true for maps of {short_text(perturbation)} in real units"
+                    )
         check_law(self.law)
         check_rule(self.rule)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from systems import PIPES
 
-from apt_evap.cli import examples
+from apt_evap.cli import _shipped
 from apt_evap.cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -67,9 +67,36 @@ def test_what_is_refused(folder, capsys, monkeypatch):
     Path("file").touch()
     assert main(["examples", "--to", "file"]) == 2
     assert "cannot write to 'file': " in capsys.readouterr().err
-    monkeypatch.setattr(examples, "_PLACES", (folder / "none",))
+    monkeypatch.setattr(_shipped, "_PLACES", (folder / "none",))
     assert main(["examples"]) == 2
     assert "the examples are not in" in capsys.readouterr().err
+
+
+def test_an_example_is_found_by_its_name(folder, capsys):
+    """It is copied with what it reads; a file of this name in the folder wins, and is not replaced."""
+    assert main(["sweep", "plan", "sweep"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("example sweep: copied sweep.toml and ni111.toml to this folder\n")
+    assert Path("sweep.toml").read_bytes() == originals()["sweep.toml"] and Path("sweep/points").is_dir()
+    assert main(["sweep", "status", "sweep", "--json"]) == 0  # the folder that the first call has made
+    assert json.loads(capsys.readouterr().out)["points"] == 4
+    Path("gamma_prime.toml").write_text("mine = 1")
+    assert main(["run", "gamma_prime"]) == 2
+    told = capsys.readouterr()
+    assert told.out == "example gamma_prime: gamma_prime.toml is in this folder already\n"
+    assert "mine" in told.err and Path("gamma_prime.toml").read_text() == "mine = 1"
+    Path("core_shell").write_text("mine = 2")  # a path without suffix
+    assert main(["run", "core_shell"]) == 2
+    assert not Path("core_shell.toml").exists()
+
+
+def test_other_names_are_refused_with_the_examples_of_the_command(folder, capsys):
+    assert main(["run", "precipitat"]) == 2
+    error = capsys.readouterr().err
+    assert "'precipitat' is neither a file nor an example of apt-evap run (did you mean 'precipitate'?)" in error
+    assert "core_shell, gamma_prime, gp_zone, grain_boundary, multilayer" in error and "sweep" not in error
+    assert main(["run", "sweep"]) == 2 and main(["run", "else/gamma_prime"]) == 2 and main(["run", "none.toml"]) == 2
+    assert os.listdir() == []
 
 
 SETTINGS = sorted(name for name in originals() if name.endswith(".toml"))

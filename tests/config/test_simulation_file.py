@@ -487,3 +487,16 @@ def test_a_settings_file_may_have_a_byte_order_mark(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text('[tip]\nmaterial = "Ni"\napex_radius = 2.0\n', encoding="utf-8-sig")
     assert read_document(path)["tip"]["apex_radius"] == 2.0
+
+
+def test_energies_in_real_units_need_responses(tmp_path):
+    """Flights are at the simulated voltage: this was refused only after the simulation."""
+    text = '[tip]\nmaterial = "Ni"\napex_radius = 3.0\n[simulation]\nions = 10\nresponses = false\n[real_units]\n'
+    path = tmp_path / "a.toml"
+    for perturbation in ("RollUp:0.1", "Unperturbed"):
+        path.write_text(f'{text}[[maps.panels]]\ntitle = "a"\nperturbation = "{perturbation}"\n')
+        if perturbation == "Unperturbed":
+            assert read_config(path).emissions
+        else:
+            with pytest.raises(ValueError, match="responses must be true for maps of RollUp"):
+                read_config(path)

@@ -5,13 +5,11 @@ import ast
 import dataclasses
 import enum
 import inspect
-import json
 import re
 import runpy
 import sys
 import textwrap
 import tomllib
-from dataclasses import replace
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
@@ -171,73 +169,6 @@ def test_a_measured_file_of_ones_own(folder, monkeypatch, capsys):
 def run_article(name, monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", [Path(name).name, *arguments])
     runpy.run_path(str(ROOT / "articles" / name), run_name="__main__")
-
-
-@pytest.mark.slow
-def test_figure_2_of_a_small_tip(folder, monkeypatch, capsys):
-    run_article("paper_figures/figure2.py", monkeypatch, "--radius", "12", "-o", "out")
-    assert (folder / "out" / "figure2.png").stat().st_size > 100_000
-    results = json.loads((folder / "out" / "figure2.json").read_text())["results"]
-    assert set(results) == {"Al[012]", "Ni[111]"}
-    for result in results.values():
-        assert result["settings"]["tip"]["material"]["name"] in ("Al", "Ni")
-        fields = np.array(result["field [V/nm]"])
-        assert fields[result["neighbours"].index(6)] > fields[result["neighbours"].index(8)]  # kinks stick out
-        assert max(result["residual [mm]"]) < ae.ResponseSettings().bound
-        # mm: half an electronvolt moves an ion by millimetres, and the roll alone by about as much
-        for column in ("lateral 0.5 eV [mm]", "roll [mm]", "then 0.5 eV [mm]"):
-            assert 1 < min(result[column]) < max(result[column]) < 40
-    assert "Ni[111]: how far" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the registration is doubtful:UserWarning")
-def test_figures_3_to_6_of_small_tips(folder, monkeypatch, capsys):
-    run_article(
-        "hidden_energies/figures3to6.py", monkeypatch, *"--radius 8 --ions 1200 --bins 24 --resamples 3 -o out".split()
-    )
-    for number in (3, 4, 5, 6):
-        assert (folder / "out" / f"figure{number}.png").stat().st_size > 50_000
-    results = json.loads((folder / "out" / "figures3to6.json").read_text())
-    shapes = {name: np.shape(study["scores"]) for name, study in results["studies"].items()}
-    assert shapes == {"Al lateral": (1, 6, 6), "Ni roll-up": (1, 6, 6), "Ni combined": (5, 6, 6)}
-    for metal, axis in (("Al", [0, 1, 2]), ("Ni", [1, 1, 1])):
-        simulated, twin = (ae.load(folder / "out" / f"{metal}_{name}_R8a.h5") for name in ("run", "twin"))
-        assert simulated.settings["tip"]["axis"] == axis
-        # two specimens: another origin of the lattice, other random numbers
-        assert simulated.settings["tip"]["offset_seed"] != twin.settings["tip"]["offset_seed"]
-        assert simulated.seed != twin.seed
-    # both mechanisms see the same region; roll-up alone is one of the five fractions
-    alone, both = (results["studies"][name] for name in ("Ni roll-up", "Ni combined"))
-    assert alone["registration"] == both["registration"]
-    assert alone["scores"][0] == both["scores"][4]
-    # nickel that rolled up looks like none that did not
-    assert alone["optimum"]["score"]["value"] > alone["baselines"]["unperturbed"]["value"] + 0.5
-    assert "| Ni combined | " in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_figure_7_of_runs_that_are_there(folder, monkeypatch, capsys, run20):
-    """The script turns the crystal by 90 degrees; so is the run here, and taken for both radii."""
-    first, rolled = run20.flown
-    turned = rolled._replace(directions=rolled.directions @ [[0, 1], [-1, 0]])
-    run = replace(run20, flown=(first, turned))
-    for name in ("figure7_R20a.h5", "figure7_R30a.h5"):
-        run.save(folder / name)
-    run_article("paper_figures/figure7.py", monkeypatch, "--redraw", "--bins", "20")
-    assert (folder / "figure7.png").stat().st_size > 100_000
-    printed = capsys.readouterr().out
-    for kind in ("depleted", "enhanced"):
-        assert f"{kind} line, R = 20 a: {kind}, " in printed  # the rectangles are where the lines are
-    results = json.loads((folder / "figure7.json").read_text())
-    assert results["ions"] == {"R = 30 a": 15_000, "R = 20 a": 15_000}
-    assert results["results"]["enhanced"]["chi_square"] == 0  # of one run with itself
-
-
-def test_figure_7_evaporates_to_one_depth(folder, monkeypatch):
-    with pytest.raises(ValueError, match="profile"):  # that few ions show no line
-        run_article("paper_figures/figure7.py", monkeypatch, "--radii", "6", "4", "--ions", "54")
-    assert [len(ae.load(folder / f"figure7_R{radius}a.h5")) for radius in (6, 4)] == [54, 16]
 
 
 @pytest.mark.slow

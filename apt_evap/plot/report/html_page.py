@@ -156,7 +156,10 @@ class Page:
         """
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=DPI, metadata={"Software": f"apt_evap {__version__}"})
-        data = file.getvalue()
+        return self.image(file.getvalue(), caption, alt=alt)
+
+    def image(self, data: bytes, caption: str = "", *, alt: str = "") -> str:
+        """Return a picture, the content of a PNG file, with its caption as HTML, str."""
         width, height = (int.from_bytes(data[start : start + 4], "big") for start in (16, 20))  # of the PNG header
         source = "data:image/png;base64," + base64.b64encode(data).decode()
         self._picture_bytes += len(source)
