@@ -18,6 +18,8 @@ RANGES = ("H", "Li", "B", "C", "N", "O", "Mg", "Si", "S", "Cl", "Ar", "Br", "Tl"
 # relative: the commission has revised Se, Mo, Yb, Hg and others since 2009, by less
 REVISED = 0.03
 MASS = 5e-5  # Da
+# the first source has no natural composition of uranium: that of Meija et al. (2016)
+URANIUM = ((234.0409, 5.4e-05), (235.0439, 0.007204), (238.0508, 0.992742))
 HEAD = '''"""Masses and abundances of the natural nuclides of all elements, written by ``tools/nuclides.py``.
 
 Abundances: CIAAW, Isotopic compositions of the elements 2021 (Meija et al., Pure Appl. Chem. 88, 293 (2016), with later
@@ -65,6 +67,8 @@ def main():
     lines = []
     for element in periodictable.elements:
         table = isotopes(element) if element.number > 0 else {}
+        if element.symbol == "U" and not table:
+            table = {round(mass): (mass, abundance) for mass, abundance in URANIUM}
         if table:
             text = ", ".join(f"({mass:.4f}, {abundance:.9g})" for mass, abundance in table.values())
             comma = "," if len(table) == 1 else ""

@@ -29,6 +29,7 @@ from a simulation to its map, and to the emission energies of a measured map:
   apt-evap info R5083.epos --json | jq .ions         also for measured files; --json for programs
   apt-evap map R5083.epos --bins 128                 map of measured ions
   apt-evap spectrum R5083.epos --save R5083.rrng     mass spectrum: peaks, background, ranges
+  apt-evap composition R5083.epos                    at.% with errors, and what no ion explains
   apt-evap index R5083.epos --element Ni             which crystal direction is where on the map
   apt-evap twin R5083.epos --element Ni              all of this: index, simulate, register, fit, report
   apt-evap paper                                     figures 2 to 7 of the paper, and what agrees with it
@@ -50,6 +51,7 @@ COMMANDS = {
     "map": "draw detector maps of a run or of measured ions",
     "info": "summarise a file",
     "spectrum": "draw and name the peaks of the mass spectrum of measured ions",
+    "composition": "composition of measured ions with its errors, and what is unexplained",
     "index": "which crystal direction is where on a measured map",
     "start": "settings file for a simulation of a measured specimen",
     "twin": "from a measured file to a simulation of its specimen, a fit and a report",

@@ -3,8 +3,9 @@
 import argparse
 from pathlib import Path
 
-from apt_evap.cli._options import add_flight, add_reading, add_speech
+from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
+from apt_evap.cli._spectrum_of_file import add_spectrum, spectrum_of
 
 _BIN = 0.05  # of the picture [Da]: narrower ones would be less than a pixel
 
@@ -12,9 +13,10 @@ _BIN = 0.05  # of the picture [Da]: narrower ones would be less than a pixel
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
-        "Draw the mass spectrum of measured ions with its background, and name its peaks: of the elements\n"
-        "that are given, or of the most probable ones. Flight length and time zero are fitted to the peaks if\n"
-        "the file has times of flight and no masses. With --ranges, the ranges of a file are drawn over it."
+        "Draw the mass spectrum of measured ions with its background, name its peaks, of all elements or of those\n"
+        "that are given, and print the composition. Flight length and time zero are fitted to the peaks if the\n"
+        "file has times of flight and no masses. With --ranges, the ranges of a file are drawn, and only their\n"
+        "ions are counted."
     )
     parser.epilog = (
         "example:\n"
@@ -24,13 +26,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "  apt-evap spectrum W_tap.raw --element W --distance 305"
     )
     parser.add_argument("file", metavar="FILE", help="measured ions (.epos, .pos, .raw, ...)")
-    add_reading(parser)
-    parser.add_argument(
-        "--element",
-        metavar="NAME[,NAME]",
-        help="ions to name, such as W or Cr,CrO; default: the most probable of 27 elements and six molecules",
-    )
-    add_flight(parser)
+    add_spectrum(parser)
     parser.add_argument("--save", metavar="FILE.rrng", help="save the ranges of the named peaks")
     parser.add_argument(
         "-o", "--output", metavar="PICTURE.png", help=".png, .pdf or .svg; default: FILE_spectrum.png in this folder"
@@ -41,15 +37,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    from dataclasses import replace
-
     from apt_evap import plot
     from apt_evap._common.files import FileError, check_path
-    from apt_evap.cli._files import file_of, read
-    from apt_evap.detection.hits import Hits
     from apt_evap.io.formats import read_ranges
     from apt_evap.io.rrng import write_rrng
-    from apt_evap.spectra.mass_spectrum import spectrum
     from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_spectrum.png")
@@ -61,18 +52,8 @@ def execute(options: argparse.Namespace) -> int:
         if saved.exists() and not options.force:
             raise FileError(f"{str(saved)!r} exists: --force overwrites it")
         check_output(saved, lambda path: True, options.force)
-    if options.mass is not None or options.species is not None:
-        raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
     ranges = None if options.ranges is None else read_ranges(options.ranges)
-    hits = read(options)
-    if not isinstance(hits, Hits):
-        raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
-    if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
-        raise ValueError(f"--distance is missing: {options.file!r} has no masses, and times of flight need it [mm]")
-    elements = None if options.element is None else options.element.split(",")
-    # ranges are drawn, no selection of ions; flight length and time zero are fitted
-    selection = replace(file_of(options), ranges=None, distance=None).select(hits)
-    result = spectrum(selection, elements, distance=options.distance, time_zero=options.time_zero)
+    result = spectrum_of(options, ranges)
     tell(options, f"{result}")
     if result.flight is not None and result.flight.peaks:
         fit = result.flight
@@ -81,12 +62,14 @@ def execute(options: argparse.Namespace) -> int:
     for name, number in counts.items():
         tell(options, f"{name}: {number:,} ions in its ranges")
     if saved is not None:
-        write_rrng(saved, result.ranges)
+        write_rrng(saved, result.ranges())
         tell(options, f"wrote {saved}")
     save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure)
     tell(options, f"wrote {picture}")
     summary = {"wrote": str(picture), "file": options.file, "ranges": None if saved is None else str(saved)}
-    names = ("name", "ions", "background", "fill", "intervals")
-    peaks = [{name: getattr(peak, name) for name in names} for peak in result.peaks]
-    tell_json(options, summary | {"peaks": peaks} | ({} if ranges is None else {"ions_in_ranges": counts}))
+    names = ("name", "formula", "charge", "ions", "error", "intervals", "others")
+    ions = [{name: getattr(ion, name) for name in names} for ion in result.ions]
+    summary |= {"ions": ions, "unexplained_peaks": [[peak.mass, peak.ions] for peak in result.unexplained]}
+    summary |= result.composition.plain()
+    tell_json(options, summary | ({} if ranges is None else {"ions_in_ranges": counts}))
     return 0

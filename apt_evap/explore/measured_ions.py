@@ -123,9 +123,9 @@ class MeasuredIons:
 
 def main_element(named: Spectrum) -> str | None:
     """Element of more than half of the named ions of a spectrum, None without one."""
-    ions: dict[str, int] = {}
-    for peak in named.peaks:
-        ions[peak.formula] = ions.get(peak.formula, 0) + peak.ions - peak.background
+    ions: dict[str, float] = {}
+    for ion in named.ions:
+        ions[ion.formula] = ions.get(ion.formula, 0) + ion.ions
     if not ions:
         return None
     most = max(ions, key=lambda formula: ions[formula])

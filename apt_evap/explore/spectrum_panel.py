@@ -150,7 +150,7 @@ class SpectrumPanel:
         self._draw()
         parts = [escape(line) for line in str(named).splitlines()]
         self.text.text = "Drag over peaks to see the map of their ions.<br>" + "<br>".join(parts)
-        formulas = list(dict.fromkeys(peak.formula for peak in named.peaks))
+        formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
         main = main_element(named)
         chosen = self._ions.selection
         options = [_ALL, *(f"ions of {formula}" for formula in formulas)]
@@ -170,7 +170,7 @@ class SpectrumPanel:
     def _draw(self):
         mass = self.named.hits.mass_to_charge
         mass = mass[np.isfinite(mass) & (mass > 0)]
-        intervals = [interval for peak in self.named.peaks for interval in peak.intervals]
+        intervals = [interval for ion in self.named.ions for interval in ion.intervals]
         last = max([1.5 * high for _, high in intervals], default=float(np.percentile(mass, 99)))
         count, edges = np.histogram(mass, np.linspace(0.0, last, _BINS + 1))
         least = 0.5
@@ -181,19 +181,21 @@ class SpectrumPanel:
         top = float(max(count.max(), 10))
         self.figure.y_range.update(start=least, end=6 * top)
         self.figure.x_range.update(start=0.0, end=last)
-        formulas = list(dict.fromkeys(peak.formula for peak in self.named.peaks))
+        formulas = list(dict.fromkeys(ion.formula for ion in self.named.ions))
         drawn: dict[str, list[Any]] = {name: [] for name in self.ranges.data}
         labels: dict[str, list[Any]] = {name: [] for name in self.labels.data}
-        for peak in self.named.peaks:
-            color = _COLORS[formulas.index(peak.formula) % len(_COLORS)]
-            for low, high in peak.intervals:
+        for ion in self.named.ions:
+            color = _COLORS[formulas.index(ion.formula) % len(_COLORS)]
+            for low, high in ion.intervals:
                 new = {"left": low, "right": high, "top": 6 * top, "bottom": least, "color": color}
                 drawn = {name: [*values, new[name]] for name, values in drawn.items()}
-            low, high = peak.intervals[0][0], peak.intervals[-1][1]
+            if not ion.intervals:
+                continue
+            low, high = ion.intervals[0][0], ion.intervals[-1][1]
             inside = count[(edges[1:] > low) & (edges[:-1] < high)]
             middle = (low + high) / 2
             if all(abs(middle - place) > 0.03 * last for place in labels["x"]):
-                new = {"x": middle, "y": float(inside.max(initial=1)), "label": peak.name, "color": color}
+                new = {"x": middle, "y": float(inside.max(initial=1)), "label": ion.name, "color": color}
                 labels = {name: [*values, new[name]] for name, values in labels.items()}
         self.ranges.data, self.labels.data = drawn, labels
         self.figure.visible = True
@@ -238,8 +240,8 @@ class SpectrumPanel:
     def _tell(self):
         selection = self._ions.selection
         number, of = len(self._ions.hits), len(self._ions.all)
-        peaks = [] if self.named is None else [peak for peak in self.named.peaks if peak.formula == selection.element]
-        intervals = [interval for peak in peaks for interval in peak.intervals]
+        chosen = [] if self.named is None else [ion for ion in self.named.ions if ion.formula == selection.element]
+        intervals = [interval for ion in chosen for interval in ion.intervals]
         if selection.mass is not None:
             intervals = [selection.mass]
         where = ", ".join(f"{low or 0:.4g} to {high or np.inf:.4g}" for low, high in intervals)
@@ -255,7 +257,7 @@ class SpectrumPanel:
             return
         self._confirmed, self.save.label = False, "save ranges"
         try:
-            write_rrng(path, self.named.ranges)
+            write_rrng(path, self.named.ranges())
             self.text.text = f"wrote {escape(str(path))}"
         except (ValueError, OSError) as error:
             self.text.text = escape(str(error))

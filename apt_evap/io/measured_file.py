@@ -221,8 +221,9 @@ class MeasuredFile:
         if note is not None:
             (named,) = made
             intervals = "; ".join(
-                f"{peak.name} at {', '.join(f'{low:.4g} to {high:.4g}' for low, high in peak.intervals)} Da"
-                for peak in named.peaks
+                f"{ion.name} at {', '.join(f'{low:.4g} to {high:.4g}' for low, high in ion.intervals)} Da"
+                for ion in named.ions
+                if ion.formula == self.peaks and ion.intervals
             )
             change = "--all-ions, --mass or --species change it"
             note(f"{len(inside):,} of {len(hits):,} ions are used, those of {intervals}; {change}")

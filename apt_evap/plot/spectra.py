@@ -1,5 +1,6 @@
 """Mass spectra, with labels at the isotopes."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -118,8 +119,9 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
     """Draw a spectrum with its background, its ranges, and the names of its peaks, or of other ranges."""
     if ranges is None:
         named = [
-            (peak.formula, _subscripts(peak.formula) + raised_charge(peak.charge), peak.intervals)
-            for peak in spectrum_of_ions.peaks
+            (ion.formula, _formula_label(ion.formula) + raised_charge(ion.charge), ion.intervals)
+            for ion in spectrum_of_ions.ions
+            if ion.intervals
         ]
     else:
         rows = zip(ranges.names, ranges.low.tolist(), ranges.high.tolist(), strict=True)
@@ -162,14 +164,27 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
             text, (place, max(top, 1)), xytext=(0, 4),
             textcoords="offset points", ha="center", va="bottom", color=color, annotation_clip=True,
         )  # fmt: skip
+    if ranges is None:
+        _mark_unexplained(ax, spectrum_of_ions, edges, count)
     bottom, top = ax.get_ylim()
     ax.set_ylim(bottom, top * (top / bottom) ** 0.12)
     ax.legend(loc="upper right", frameon=False, fontsize="small")
     return ax
 
 
-def _subscripts(formula):
-    return "".join(f"$_{{{character}}}$" if character.isdigit() else character for character in formula)
+def _mark_unexplained(ax, spectrum_of_ions, edges, count):
+    """Mark the peaks that no ion explains."""
+    places = [(peak.mass, count[_bins_of_peak(edges, peak.mass)]) for peak in spectrum_of_ions.unexplained]
+    marks = [(mass, 1.6 * max(int(inside.max()), 1)) for mass, inside in places if inside.size]
+    if marks:
+        label = f"unexplained, {spectrum_of_ions.unexplained_part:.1%} of the ions in peaks"
+        ax.plot(*zip(*marks, strict=True), "v", color="k", markersize=5, linestyle="none", label=label, zorder=4)
+
+
+def _formula_label(formula):
+    """A formula with its numbers as subscripts, and that of an isotope before its element as a superscript."""
+    text = re.sub(r"(?<=[A-Za-z])(\d+)", r"$_{\1}$", formula)
+    return re.sub(r"^(\d+)", r"$^{\1}$", text)
 
 
 def _masses(ions):

@@ -17,7 +17,7 @@ SPECTRUM_ELEMENTS = (
     "Rh", "Ag", "Ta", "W", "Ir", "Pt", "Au",
 )
 # fmt: on
-"""Elements that the ions of a spectrum are compared with, also if nobody names them."""
+"""Elements with which the fit of a flight length may start."""
 
 # relative: atomic weights rounded to three digits still count as natural, the isotopes of Ni, Cu, Fe and Si do not
 _SAME_MASS = 1e-3

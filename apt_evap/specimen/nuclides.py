@@ -112,6 +112,7 @@ ISOTOPES: dict[str, tuple[tuple[float, float], ...]] = {
     "Bi": ((208.9804, 1),),
     "Th": ((230.0331, 0.0002), (232.0381, 0.9998)),
     "Pa": ((231.0359, 1),),
+    "U": ((234.0409, 5.4e-05), (235.0439, 0.007204), (238.0508, 0.992742)),
 }
 # fmt: on
 """Mass [Da] and natural abundance (fraction) of each natural isotope, by element."""

@@ -1,8 +1,6 @@
 """Combs of isotopes: where the isotopes of an ion lie in a spectrum whose masses are only known to a factor."""
 
 import math
-import re
-from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from copy import copy
 from typing import NamedTuple
@@ -10,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_kind, did_you_mean, short_text
-from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.spectra.ion_names import Abundances, ion_name
 
 STEP = 5e-4
 """Width of a bin of the logarithm of m/n: half the width of a peak of a good instrument."""
@@ -65,43 +62,8 @@ class Comb(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Such as "W3+"."""
-        return f"{self.formula}{self.charge if self.charge > 1 else ''}+"
-
-
-def atoms_of_formula(formula: str) -> dict[str, int]:
-    """Number of atoms of each element in an ion such as "CrO2"."""
-    atoms: Counter[str] = Counter()
-    for element, number in re.findall(r"([A-Z][a-z]?)([1-9]?)", formula):
-        atoms[element] += int(number or 1)
-    return dict(atoms)
-
-
-def isotopes_of(formula: str) -> tuple[Floats, Floats]:
-    """Masses [Da] and abundances of the isotopes of an ion such as "W" or "CrO2", without rare ones.
-
-    Raises
-    ------
-    ValueError
-        If the text is not a formula of elements of `ISOTOPES`.
-    """
-    check_kind(formula, "elements", str, 'formulas such as "W" or "CrO"')
-    if not re.fullmatch(r"([A-Z][a-z]?[1-9]?)+", formula) or len(formula) > 20:
-        raise ValueError(f'elements must be formulas such as "W" or "CrO2", got {short_text(formula)}')
-    pattern = {0.0: 1.0}
-    for element, number in atoms_of_formula(formula).items():
-        if element not in ISOTOPES:
-            hint = did_you_mean(element, ISOTOPES)
-            raise ValueError(f"elements must be chemical symbols such as W, got {short_text(element)}{hint}")
-        for _ in range(number):
-            joined: dict[float, float] = defaultdict(float)
-            for mass, abundance in pattern.items():
-                for isotope, share in ISOTOPES[element]:
-                    joined[round(mass + isotope, 3)] += abundance * share
-            pattern = {mass: abundance for mass, abundance in joined.items() if abundance > _RARE / 10}
-    masses, abundances = np.array(sorted(pattern.items())).T
-    common = abundances > _RARE
-    return masses[common], abundances[common] / abundances[common].sum()
+        """Such as "W³⁺"."""
+        return ion_name(self.formula, self.charge)
 
 
 class LogSpectrum:
@@ -143,29 +105,6 @@ class LogSpectrum:
         rest._add_up()
         return rest
 
-    def ions(self, low: float, high: float) -> tuple[float, float]:
-        """Number of ions between two edges of bins [Da], and that of the background."""
-        ends = np.rint(np.log((low, high)) / STEP).astype(int) - self._first
-        ions, background = (float(np.diff(sums[ends])[0]) for sums in (self._sums, self._below))
-        return ions, background
-
-    def peaks_without(self, named: Sequence[tuple[float, float]]) -> tuple[tuple[float, int], ...]:
-        """Place [Da] and number of ions of each peak outside some intervals [Da], the largest first."""
-        from scipy.ndimage import uniform_filter1d
-
-        ions, below = (uniform_filter1d(values, _PEAK) * _PEAK for values in (self.counts, self.background))
-        above = ions > below + _SIGNIFICANT * np.sqrt(below + _SIGNIFICANT) + _FEWEST
-        for low, high in named:
-            first, last = np.searchsorted(self.edges, (low * (1 - _MARGIN / 2), high * (1 + _MARGIN)))
-            above[max(first, 0) : last] = False
-        edges = np.flatnonzero(np.diff(np.pad(above.astype(np.int8), 1)))
-        peaks = []
-        for first, last in edges.reshape(-1, 2).tolist():
-            top = first + int(np.argmax(ions[first:last]))
-            net = float((self.counts - self.background)[first:last].sum())
-            peaks.append((float(self.edges[top]), round(net)))
-        return tuple(sorted(peaks, key=lambda peak: -peak[1]))
-
     def comb(self, formula: str, charge: int, low: float, high: float) -> Comb | None:
         """The best comb of an ion for factors between two bounds.
 
@@ -185,7 +124,9 @@ class LogSpectrum:
         """
         from scipy.ndimage import gaussian_filter1d
 
-        masses, abundances = isotopes_of(formula)
+        masses, abundances = Abundances().lines(formula)
+        common = abundances > _RARE
+        masses, abundances = masses[common], abundances[common] / abundances[common].sum()
         places = np.log(masses / charge) / STEP - self._first  # in bins
         margin = math.ceil(_MARGIN / STEP)
         first, size = math.floor(places[0]) - margin, math.ceil(places[-1]) - math.floor(places[0]) + 2 * margin

@@ -1,7 +1,7 @@
-"""Mass spectra: which peaks are which ions, their background, and ranges of mass."""
+"""Mass spectra: the ions that explain their peaks together, the composition, and ranges of mass."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -9,78 +9,85 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_kind, check_number, short_text
+from apt_evap._common.validation import check_array, check_kind, check_number, short_text
 from apt_evap.detection.hits import Hits
-from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
+from apt_evap.spectra.composition import MOST_UNEXPLAINED, Amounts, Composition
+from apt_evap.spectra.explanation import Explainer, Explanation
 from apt_evap.spectra.flight_fit import FlightFit
-from apt_evap.spectra.isotope_comb import (
-    LARGEST_MISFIT,
-    Comb,
-    LogSpectrum,
-    atoms_of_formula,
-    in_intervals,
-    isotopes_of,
-)
+from apt_evap.spectra.flight_search import fitted_flight
+from apt_evap.spectra.ion_names import Abundances, Ion, atoms_of_formula, formula_of_atoms
+from apt_evap.spectra.ion_profiles import IonProfiles
+from apt_evap.spectra.isotope_comb import in_intervals
+from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.mass_ranges import Ranges
+from apt_evap.spectra.peak_contents import PeakContents
+from apt_evap.spectra.peak_scale import HIGHEST, LOWEST
+from apt_evap.spectra.ranged_ions import RangedIons, RangeMisfit
+from apt_evap.warnings import DataWarning, warn
 
 FEWEST_OF_ELEMENT = 4000
 """Ions of an element that are enough for a map."""
-_MOLECULES = ("H2", "OH", "H2O", "N2", "O2", "CO")  # of the residual gas
-_HIGHEST_CHARGES = ((85.0, 2), (170.0, 3), (math.inf, 4))  # mass [Da] below which ions have at most this charge
-_EXPECTED = 3  # charge that every expected ion may have
-# of the factor on m/n: of a file, of a nominal length, with the first ion of a fit, with a fit
-_FILE, _FLIGHT, _BEGUN, _FITTED = 0.01, 0.1, 0.02, 0.006
-_BETTER = 1.1  # ions that a rival explains over those of a comb that it displaces
-_ALIKE = 0.85  # ions that a rival explains over those of a comb, from which it is named, too
-_LEAST = 5e-4  # of all ions: smaller combs have no name
-_MOST = 15  # ions with a name
-_STEPS = 4  # of the fit of the flight
-_STARTS = 3  # ions of a kind that the fit may start with
-_WELL_NAMED = 0.97  # part of the ions above the background that are explained: no other start is tried
+FEWEST_OF_COMPOSITION = 200
+"""Ions of a spectrum that are enough for a composition."""
+_CLEAR, _UNLIKE, _FEWEST = 5.0, 0.3, 30.0  # unexplained ions: in errors of counting, part of the peak, and number
+_SHOWN = 8  # unexplained peaks in a text
 _PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
 
 
 @dataclass(frozen=True)
-class SpectrumPeaks:
-    """Peaks of an ion in a spectrum.
+class SpectrumIon:
+    """An ion of a spectrum.
 
     Parameters
     ----------
     name : str
-        Ion and charge, such as "W3+".
+        Such as "C₂⁺", two atoms with one charge, or "C²⁺", one atom with two.
     formula : str
-        Ion without its charge, such as "W".
+        Atoms, such as "C2".
     charge : int
         Charge state.
+    ions, error : float
+        Number of ions above the background, with its standard error.
     intervals : tuple of tuple of float
-        Bounds of its peaks on the scale of m/n [Da].
-    ions, background : int
-        Ions in the intervals, and those of the background among them.
-    fill : float
-        Part of the ions about the peaks that the isotopes explain.
-    factor : float
-        m/n of the peaks over that of the isotopes.
+        Bounds of the peaks that are its own [Da]; none where other ions have more ions in all its peaks.
     others : tuple of str
-        Names of other ions that explain these peaks as well.
+        Names of other ions that explain its peaks about as well.
     """
 
     name: str
     formula: str
     charge: int
+    ions: float
+    error: float
     intervals: tuple[tuple[float, float], ...]
-    ions: int
-    background: int
-    fill: float
-    factor: float
     others: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         where = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in self.intervals)
-        others = f"; or {', '.join(self.others)}" if self.others else ""
-        return (
-            f"{self.name}: {self.ions:,} ions at {where} Da, {self.background:,} of them background "
-            f"(isotopes explain {self.fill:.0%}{others})"
-        )
+        others = f", or {', '.join(self.others)}" if self.others else ""
+        return f"{self.name}{others}: {self.ions:,.0f} ± {self.error:,.0f} ions" + (f" at {where} Da" if where else "")
+
+
+@dataclass(frozen=True)
+class UnexplainedPeak:
+    """A peak that the ions of a spectrum do not explain.
+
+    Parameters
+    ----------
+    mass : float
+        m/n [Da].
+    ions : float
+        Ions above the background without an explanation.
+    perhaps : str
+        An ion of this m/n that has no other evidence; "" if there is none.
+    """
+
+    mass: float
+    ions: float
+    perhaps: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.mass:.5g} Da ({self.ions:,.0f} ions{f', perhaps {self.perhaps}' if self.perhaps else ''})"
 
 
 class Spectrum:
@@ -90,59 +97,116 @@ class Spectrum:
     ----------
     hits : Hits
         The ions, with mass_to_charge [Da].
-    peaks : tuple of SpectrumPeaks
-        Ions with a name, the most frequent first.
+    peaks : PeakContents
+        Their peaks.
+    source : object
+        What explains the peaks: the ions of elements, or those of ranges.
     flight : FlightFit or None
         Time zero and flight length of m/n; None if the ions had m/n before.
     refused : str
         Why a requested element has no peaks; "" if all have.
+
+    Attributes
+    ----------
+    ions : tuple of SpectrumIon
+        Ions with a name, the most frequent first.
+    unexplained : tuple of UnexplainedPeak
+        Peaks that these ions do not explain, the largest first.
+    unexplained_part : float
+        Their part of the ions in all peaks.
+    misfits : tuple of RangeMisfit
+        Of ranges that a file gives: those that their ions do not explain, the largest first.
+    calibration : MassCalibration
+        Relative error of m/n, with its own uncertainty.
     """
 
     def __init__(
-        self, hits: Hits, counts: LogSpectrum, peaks: tuple[SpectrumPeaks, ...], flight: FlightFit | None, refused: str
+        self,
+        hits: Hits,
+        peaks: PeakContents,
+        source: "_Named | _Ranged",
+        flight: FlightFit | None,
+        refused: str,
     ) -> None:
-        self.hits, self.peaks, self.flight, self.refused = hits, peaks, flight, refused
-        self._counts = counts
+        self.hits, self.flight, self.refused = hits, flight, refused
+        self.ions, self.unexplained, self.unexplained_part = source.named, source.unexplained, source.unexplained_part
+        self.misfits: tuple[RangeMisfit, ...] = source.misfits
+        self.calibration: MassCalibration = source.calibration
+        self._peaks, self._source = peaks, source
 
     def __repr__(self) -> str:
-        names = ", ".join(peak.name for peak in self.peaks) or "no ion named"
-        return f"<Spectrum: {len(self.hits):,} ions, {names}>"
+        names = ", ".join(ion.name for ion in self.ions) or "no ion named"
+        return f"<Spectrum: {len(self.hits):,} ions, {self.unexplained_part:.1%} unexplained, {names}>"
 
     def __str__(self) -> str:
-        lines = [] if self.flight is None else [str(self.flight)]
-        lines += [str(peak) for peak in self.peaks]
+        where = ", ".join(map(str, self.unexplained[:_SHOWN])) + (", ..." if len(self.unexplained) > _SHOWN else "")
+        ranged, first = isinstance(self._source, _Ranged), f"unexplained: {self.unexplained_part:.1%} of the ions in "
+        lines = [first + ("ranges" if ranged else f"peaks, at {where}" if where else "peaks")]
+        lines += [f"range {misfit}" for misfit in self.misfits]
+        lines += [f"peaks in no range at {where}"] if ranged and where else []
+        lines += [] if self.flight is None else [str(self.flight)]
+        lines += [str(ion) for ion in self.ions]
+        lines += [f"{element} or {' and '.join(others)}: the peaks do not decide" for element, others in self.either]
         lines += [self.refused] if self.refused else []
-        if not self.peaks and not self.refused:
+        if not self.ions and not self.refused:
             lines.append("no ion named: no peaks of known isotopes above the background")
-        if len(unnamed := self.unnamed):
-            where = ", ".join(f"{place:.4g}" for place, _ in unnamed[:5])
-            lines.append(f"peaks without a name at {where}{', ...' if len(unnamed) > 5 else ''} Da")
-        return "\n".join(lines)
+        return "\n".join([*lines, *str(self.composition).splitlines()[1:]])
+
+    @property
+    def either(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Elements of which the data cannot tell whether others are there in their place."""
+        return self._source.either
+
+    @cached_property
+    def composition(self) -> Composition:
+        """Composition in at.%, without one where more than 10 % of the ions in peaks are unexplained."""
+        return self._composition(self._source.amounts, len(_detected(self.hits)))
+
+    def composition_of(self, selection: Hits | NDArray[np.bool_]) -> Composition:
+        """Composition of a part of the ions, with the ions, the shapes and the places of the whole spectrum.
+
+        Parameters
+        ----------
+        selection : Hits or array_like of bool
+            Ions with mass_to_charge, such as those of a region; or which ions of `hits`, shape (n,).
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong, or there is no m/n.
+        """
+        if not isinstance(selection, Hits):
+            selection = self.hits[check_array(selection, "selection", (len(self.hits),), dtype=bool)]
+        mass = _detected(selection)
+        if not self.ions:
+            return self._composition(self._source.amounts, len(mass))
+        ions, covariance = self._source.amounts_of(mass)
+        return self._composition(Amounts(self._source.amounts.atoms, ions, covariance), None)
+
+    def _composition(self, amounts, number):
+        refused = ""
+        if number is not None and number < FEWEST_OF_COMPOSITION:
+            refused = f"{number:,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
+        return amounts.composition(self.unexplained_part, refused)
 
     def background(self, edges: Floats) -> Floats:
         """Number of ions of the background between edges of m/n [Da], shape (k + 1,), array of shape (k,)."""
-        below = np.concatenate([[0.0], np.cumsum(self._counts.background)])
-        return np.diff(np.interp(edges, self._counts.edges, below))
+        below = np.pad(np.cumsum(self._source.background), (1, 0))
+        places = self._peaks.scale.bins(np.clip(edges, LOWEST, HIGHEST)) + 0.5
+        return np.diff(np.interp(places, np.arange(len(below)), below))
 
-    @cached_property
-    def unnamed(self) -> tuple[tuple[float, int], ...]:
-        """Place [Da] and number of ions of each peak without a name, the largest first."""
-        named = [interval for peak in self.peaks for interval in peak.intervals]
-        return self._counts.peaks_without(named)
-
-    @cached_property
     def ranges(self) -> Ranges:
-        """Ranges of mass of all peaks.
+        """Ranges of mass of all peaks: as wide that lost ions and ions of others are fewest in sum.
 
         Raises
         ------
         ValueError
             If no ion has a name.
         """
-        if not self.peaks:
+        rows = sorted((low, high, ion.formula) for ion in self.ions for low, high in ion.intervals)
+        if not rows:
             raise ValueError(f"ranges need peaks, got a spectrum without a name: {self.hits!r}")
-        formulas = list(dict.fromkeys(peak.formula for peak in self.peaks))
-        rows = sorted((low, high, peak.formula) for peak in self.peaks for low, high in peak.intervals)
+        formulas = list(dict.fromkeys(ion.formula for ion in self.ions))
         return Ranges(
             tuple(formula for _, _, formula in rows),
             np.array([low for low, _, _ in rows]),
@@ -164,32 +228,118 @@ class Spectrum:
         ValueError
             If it has no peaks, or too few ions for a map.
         """
-        chosen = [peak for peak in self.peaks if peak.formula == formula]
-        if not chosen:
+        wanted = formula_of_atoms(atoms_of_formula(formula))
+        intervals = [interval for ion in self.ions if ion.formula == wanted for interval in ion.intervals]
+        if not intervals:
             reason = self.refused or f"the spectrum has no peaks of {short_text(formula)}"
             raise ValueError(reason)
         (mass,) = self.hits.require("mass_to_charge")
-        inside = in_intervals(mass, [interval for peak in chosen for interval in peak.intervals])
+        inside = in_intervals(mass, intervals)
         if (number := int(np.count_nonzero(inside))) < FEWEST_OF_ELEMENT:
             raise ValueError(f"only {number:,} ions are in peaks of {formula}, expected at least {FEWEST_OF_ELEMENT:,}")
         return inside
 
 
+class _Named:
+    """What a spectrum reports of the ions that explain it."""
+
+    misfits: tuple[RangeMisfit, ...] = ()
+
+    def __init__(self, peaks: PeakContents, explanation: Explanation) -> None:
+        fit, chosen = explanation.fit, np.asarray(explanation.chosen, int)
+        contents, ions = explanation.contents, explanation.ions
+        self.calibration, self.background = explanation.calibration, contents.background
+        self.profiles = IonProfiles(peaks, contents, fit.shares[chosen], explanation.amplitudes)
+        errors = np.sqrt(np.maximum(np.diag(explanation.covariance), 0)).tolist() if len(ions) else []
+        intervals = self.profiles.intervals()
+        named = [
+            SpectrumIon(
+                ion.name, ion.formula, ion.charge, number, error, tuple(bounds), tuple(_names(fit.ions, others))
+            )
+            for ion, number, error, bounds, others in zip(
+                ions, explanation.amplitudes.tolist(), errors, intervals, explanation.others, strict=True
+            )
+        ]
+        self.named = tuple(sorted(named, key=lambda ion: -ion.ions))
+        self.amounts = Amounts(
+            [ion.atoms for ion in ions],
+            explanation.amplitudes,
+            explanation.covariance,
+            [([fit.ions[n].atoms for n in numbers], x) for numbers, x in explanation.sets],  # type: ignore[union-attr]
+        )
+        rest = contents.ions - fit.explained(explanation.chosen, explanation.amplitudes)
+        large = contents.seen & (rest > np.maximum(_UNLIKE * contents.ions, _FEWEST))
+        large &= rest > _CLEAR * np.sqrt(contents.variance)
+        self.unexplained = tuple(
+            UnexplainedPeak(float(contents.mass[at]), float(rest[at]), _perhaps(explanation, float(contents.mass[at])))
+            for at in sorted(np.flatnonzero(large), key=lambda at: -rest[at])
+        )
+        self.unexplained_part = float(rest[large].sum() / max(contents.total, 1.0))
+        self.either = tuple(explanation.either.items())
+
+    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
+        """Numbers of ions and their covariance among some ions [Da]."""
+        return self.profiles.amounts(mass)
+
+
+class _Ranged:
+    """What a spectrum reports of the ions of ranges."""
+
+    either: tuple[tuple[str, tuple[str, ...]], ...] = ()
+
+    def __init__(self, peaks: PeakContents, ranges: Ranges, abundances: Abundances, mass: Floats) -> None:
+        contents = peaks.fit()
+        self.calibration, self.background = MassCalibration(), contents.background
+        self._ranged = RangedIons(peaks, contents, ranges, abundances)
+        ions, covariance = self._ranged.amounts(mass)
+        errors = np.sqrt(np.maximum(np.diag(covariance), 0)).tolist()
+        named = []
+        for ion, rows, number, error in zip(self._ranged.ions, self._ranged.rows, ions.tolist(), errors, strict=True):
+            bounds = tuple((float(ranges.low[row]), float(ranges.high[row])) for row in rows)
+            named.append(SpectrumIon(ion.name, ion.formula, ion.charge, number, error, bounds))
+        self.named = tuple(sorted(named, key=lambda ion: -ion.ions))
+        misfits, self.unexplained_part = self._ranged.misfits(mass, ions)
+        self.misfits = tuple(misfits)
+        outside = sorted(self._ranged.outside(), key=lambda peak: -peak[1])
+        self.unexplained = tuple(UnexplainedPeak(place, number) for place, number in outside)
+        self.amounts = Amounts([ion.atoms for ion in self._ranged.ions], ions, covariance)
+
+    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
+        """Numbers of ions and their covariance among some ions [Da]."""
+        return self._ranged.amounts(mass)
+
+
+def _names(ions: Sequence[Ion | None], numbers):
+    return [ion.name for ion in (ions[number] for number in numbers) if ion is not None]
+
+
+def _perhaps(explanation, mass):
+    near = [e for e, (place, _) in explanation.perhaps.items() if abs(math.log(place / mass)) < 1e-3]
+    return near[0] if near else ""
+
+
 def spectrum(
     hits: Hits,
     elements: str | Sequence[str] | None = None,
+    ranges: Ranges | None = None,
+    isotopes: Mapping[str, Mapping[int, float]] | None = None,
     *,
     distance: float | None = None,
     time_zero: float = 0.0,
 ) -> Spectrum:
-    """Mass spectrum: m/n, the ions of its peaks, and ranges of mass.
+    """Mass spectrum: m/n, the ions that explain its peaks, the composition, and ranges of mass.
 
     Parameters
     ----------
     hits : Hits
         Ions with mass_to_charge; or with times of flight, voltages and detector coordinates, and then with `distance`.
     elements : str or sequence of str, optional
-        Ions that are expected, such as "W" or ["Cr", "CrO"]; by default the most probable ones are named.
+        Elements and ions that are expected, such as "W" or ["Cr", "CrO"]: only ions of these elements are named. By
+        default all elements are tried, rare ones with more evidence. "D" is deuterium, "57Fe" an isotope.
+    ranges : Ranges, optional
+        Ranges of a file: only their ions are counted, and ranges that their ions do not explain are reported.
+    isotopes : mapping, optional
+        Abundances of an enriched element by mass number, such as {"Si": {28: 0.5, 30: 0.5}}.
     distance : float, optional
         Nominal distance from the apex to the detector [mm], to 5 %. The flight length is fitted to the peaks, and the
         time zero too if they are of ions of different m/n.
@@ -203,26 +353,34 @@ def spectrum(
     Raises
     ------
     ValueError
-        If there is no m/n and it cannot be computed, or an element is unknown.
+        If there is no m/n and it cannot be computed, an element or isotope is unknown, abundances do not sum to one, or
+        the ranges contain no isotopes of their ions.
+
+    Warns
+    -----
+    DataWarning
+        If some m/n are not above zero.
 
     Notes
     -----
-    The isotopes of each ion and charge state are a comb. One factor on m/n puts it on the spectrum; the ion is there if
-    the comb explains at least 70 % of the ions above the background about it, and no other comb explains 10 % more of
-    the same ions. In a measured spectrum of tungsten it explains 90 % for W3+, 68 % for Re3+.
+    All peaks have one shape, and lie on a smooth background; their contents are fitted by likelihood. Ions are chosen
+    by the contents and places of all peaks together, against a cost of every element and ion. See
+    :doc:`/composition`.
 
     Examples
     --------
     >>> rng = np.random.default_rng(1)
     >>> mass = np.append(rng.choice([62.93, 64.93], 5000, p=[0.69, 0.31]), rng.uniform(1, 100, 5000))
     >>> spectrum = ae.spectrum(ae.Hits(mass_to_charge=mass * rng.normal(1, 5e-4, 10000)), "Cu")
-    >>> [peak.name for peak in spectrum.peaks]
-    ['Cu+']
+    >>> [ion.name for ion in spectrum.ions]
+    ['Cu⁺']
     """
     check_kind(hits, "hits", Hits, "Hits")
     formulas = None if elements is None else [elements] if isinstance(elements, str) else list(elements)
-    for formula in formulas or ():
-        isotopes_of(formula)
+    formulas = None if formulas is None else [formula_of_atoms(atoms_of_formula(formula)) for formula in formulas]
+    abundances = Abundances(isotopes)
+    if ranges is not None and formulas is not None:
+        raise ValueError("a spectrum has elements or ranges, got both: ranges name their ions")
     time_zero = check_number(time_zero, "time_zero", unit="ns")
     flight = None
     if hits.mass_to_charge is None:
@@ -231,180 +389,89 @@ def spectrum(
             lacking = ", ".join(missing) if missing else "distance"
             raise ValueError(f"a spectrum needs mass_to_charge, or times of flight with {lacking}, got {hits!r}")
         flight = FlightFit(check_number(distance, "distance", above=0, unit="mm"), time_zero)
-        flight = _fitted(hits, flight, formulas)
+        flight = fitted_flight(hits, flight, formulas)
         hits = replace(hits, mass_to_charge=flight.masses(hits))
-    counts = LogSpectrum(_detected(hits))
-    tolerance = _FILE if flight is None else _FITTED if flight.peaks else _FLIGHT
-    combs = _combs(counts, formulas, tolerance)
-    refused = "" if formulas is None else _refusal(counts, formulas, combs, tolerance)
-    return Spectrum(hits, counts, tuple(_peaks(counts, combs)), flight, refused)
+    else:
+        _warn_of_masses(hits)
+    mass = _detected(hits)
+    peaks = PeakContents(mass)
+    if ranges is not None:
+        return Spectrum(hits, peaks, _Ranged(peaks, ranges, abundances, mass), flight, "")
+    if formulas is None:
+        return Spectrum(hits, peaks, _Named(peaks, Explainer(peaks, abundances).explain()), flight, "")
+    explanation = Explainer(peaks, abundances, formulas, only=True).explain()
+    source = _Named(peaks, explanation)
+    displaced: dict[str, str] = {}
+    if source.unexplained_part > MOST_UNEXPLAINED:
+        displaced = _displaced(source, Explainer(peaks, abundances, formulas).explain())
+        if displaced:
+            rest = [formula for formula in formulas if not set(atoms_of_formula(formula)) & set(displaced)]
+            source = _Named(peaks, Explainer(peaks, abundances, rest, only=True).explain())
+    return Spectrum(hits, peaks, source, flight, _refusal(source, explanation, formulas, displaced))
 
 
 def _detected(hits):
+    """m/n of the detected ions between `LOWEST` and `HIGHEST` [Da]."""
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
-        return mass[hits.detected & (mass > 0)]
+        return mass[hits.detected & (mass > LOWEST) & (mass < HIGHEST)].astype(np.float64)
 
 
-def _fitted(hits, flight, formulas):
-    """Flight length and time zero after some steps of the fit: from the first ions, or from others that explain more.
+def _warn_of_masses(hits):
+    (mass,) = hits.require("mass_to_charge")
+    with np.errstate(invalid="ignore"):
+        wrong = mass[hits.detected & (mass < 0)]
+    if len(wrong):
+        warn(
+            f"mass_to_charge must be > 0 [Da], got {len(wrong):,} of {len(mass):,} ions down to {wrong.min():.4g}: "
+            "these are left out",
+            DataWarning,
+        )
 
-    A few expected ions may fit the peaks of others: Al2+ and Al+ those of Si2+ and N2+, 4 % beside them. The peaks that
-    then have no name of any ion show it.
+
+def _displaced(source, rival):
+    """Elements that other elements displace where all are tried, with the sentence that says so.
+
+    A few expected elements may fit some peaks of others: Re3+ two of the four of W3+.
     """
-    flight = flight.sharpened(hits)
-    counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
-    best, most = flight, -math.inf
-    for start in _starts(counts, formulas):
-        fit = _fitted_from(hits, flight, start, formulas)
-        part = _named_part(hits, fit, formulas)
-        # a nominal length is good to some per cent
-        score = part - abs(math.log(fit.distance / flight.distance))
-        if score > most:
-            best, most = fit, score
-        if formulas is None or part > _WELL_NAMED:
-            break
-    return best
-
-
-def _starts(counts, formulas):
-    """Ions that a fit may start with: expected ones, each without the peaks of those before, then any."""
-    for known in (formulas, None):
-        rest = counts
-        for _ in range(_STARTS):
-            start = next(_candidates(rest, known, _FLIGHT), None)
-            if start is None:
-                break
-            yield start[0]
-            rest = rest.without(start[0].intervals)
-        if formulas is None:
-            return
-
-
-def _fitted_from(hits, flight, comb, formulas):
-    """The fit that starts with the peaks of one ion."""
-    combs, nominal = [comb], flight.distance
-    chosen = [*(formulas or ["H"]), comb.formula]
-    for step in range(_STEPS):
-        if step:
-            counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
-            # the first comb gives the factor of the others
-            combs = [comb for comb, _ in _combs(counts, chosen, _FITTED if step > 1 else _BEGUN)]
-        if not combs:
-            return flight
-        better = flight.improved(hits, combs)
-        if not abs(better.distance / nominal - 1.0) < _FLIGHT:  # it leads away from the spectrum
-            return flight
-        flight = better
-    return flight
-
-
-def _named_part(hits, flight, formulas):
-    """Part of the ions above the background that ions with a name explain."""
-    rest = counts = LogSpectrum(_detected(replace(hits, mass_to_charge=flight.masses(hits))))
-    explained = 0.0
-    for known in (None,) if formulas is None else (formulas, None):
-        for comb, _ in _combs(rest, known, _FITTED):
-            rest = rest.without(comb.intervals)
-            explained += comb.ions * comb.fill
-    above = float((counts.counts - counts.background).sum())
-    return explained / above if above > 0 else 0.0
-
-
-def _combs(counts, formulas, tolerance):
-    """Combs of a spectrum that no other one displaces, the largest first, each with the names of its rivals."""
-    chosen: list[tuple[Comb, tuple[str, ...]]] = []
-    fewest = _LEAST * counts.counts.sum()
-    for _ in range(_MOST):
-        named = {comb.name for comb, _ in chosen}  # an ion has one comb: another shift of it is another ion
-        candidates = _candidates(counts, formulas, tolerance)
-        best = next((pair for pair in candidates if pair[0].ions >= fewest and pair[0].name not in named), None)
-        if best is None:
-            break
-        chosen.append(best)
-        counts = counts.without(best[0].intervals)
-    return chosen
-
-
-def _candidates(counts, formulas, tolerance):
-    """Combs that explain a spectrum and whose ions none explains better, the largest first, with similar ones."""
-    bounds = 1.0 - tolerance, 1.0 + tolerance
-    combs = [
-        comb
-        for formula in dict.fromkeys([*SPECTRUM_ELEMENTS, *_MOLECULES, *(formulas or ())])
-        for charge in _charges(formula, formula in (formulas or ()))
-        if (comb := counts.comb(formula, charge, *bounds)) is not None
-        and comb.fill >= 1 - LARGEST_MISFIT
-        and comb.intervals
-    ]
-    scores = {comb: comb.ions * comb.fill for comb in combs}
-    for comb in sorted(combs, key=lambda comb: -comb.ions):
-        if formulas is not None and comb.formula not in formulas:
-            continue
-        rivals = [other for other in combs if other is not comb and _shared(comb, other) > 0.5]
-        if all(scores[other] <= _BETTER * scores[comb] for other in rivals):
-            yield comb, tuple(other.name for other in rivals if scores[other] > _ALIKE * scores[comb])
-
-
-def _charges(formula, expected):
-    """Charge states of an ion that are tried."""
-    highest = _EXPECTED if expected else 1
-    if formula in ISOTOPES:
-        highest = max(highest, next(charge for mass, charge in _HIGHEST_CHARGES if mean_mass(formula) < mass))
-    return range(1, highest + 1)
-
-
-def _shared(comb, other):
-    """Part of the width of a comb's peaks that another comb has, too."""
-    width = sum(high - low for low, high in comb.intervals)
-    both = sum(
-        max(0.0, min(high, last) - max(low, first)) for low, high in comb.intervals for first, last in other.intervals
-    )
-    return both / width
-
-
-def _peaks(counts, combs):
-    """Peaks of combs; where two overlap, the first comb has the ions."""
-    taken: list[tuple[float, float]] = []
-    for comb, others in combs:
-        intervals = []
-        for interval in comb.intervals:
-            low, high = interval
-            for first, last in taken:
-                if first < high and low < last:  # overlap: keep the larger part beside it
-                    low, high = (low, first) if first - low > high - last else (last, high)
-            if high - low > 0.3 * (interval[1] - interval[0]):
-                intervals.append((low, high))
-        if not intervals:
-            continue
-        taken += intervals
-        ions, below = np.sum([counts.ions(*interval) for interval in intervals], axis=0)
-        yield SpectrumPeaks(
-            comb.name, comb.formula, comb.charge, tuple(intervals), round(ions), round(below), comb.fill, comb.factor,
-            others,
-        )  # fmt: skip
-
-
-def _refusal(counts, formulas, combs, tolerance):
-    """Why some of the ions that are expected have no peaks."""
-    missing = [formula for formula in formulas if formula not in {comb.formula for comb, _ in combs}]
-    reasons = []
-    for formula in missing:
-        bounds = 1.0 - tolerance, 1.0 + tolerance
-        tried = [
-            comb for charge in _charges(formula, True) if (comb := counts.comb(formula, charge, *bounds)) is not None
+    present = {name for ion in rival.ions for name in ion.atoms}
+    lost = {name for ion in source.named for name in atoms_of_formula(ion.formula)} - present
+    sentences = {}
+    for name in sorted(lost):
+        ions = [ion for ion in source.named if name in atoms_of_formula(ion.formula)]
+        places = [interval for ion in ions for interval in ion.intervals]
+        others = [
+            ion.name
+            for ion, number in zip(rival.ions, rival.chosen, strict=True)
+            if in_intervals(rival.contents.mass[[rival.fit.main[number]]], places).any()
         ]
-        if not tried:
-            reasons.append(f"no peaks of {formula}: no ions above the background")
+        by = f"{', '.join(others)} fits" if others else "others fit"
+        sentences[name] = f"no peaks of {name}: {by} those of {', '.join(ion.name for ion in ions)} better"
+    return sentences
+
+
+def _refusal(source, explanation, formulas, displaced):
+    """Why some of the ions that are expected have no peaks."""
+    named = {ion.formula for ion in source.named}
+    reasons = []
+    for formula in formulas:
+        if formula in named:
             continue
-        best = max(tried, key=lambda comb: comb.ions * comb.fill)
-        if best.fill < 1 - LARGEST_MISFIT:
-            reasons.append(
-                f"no peaks of {formula}: the isotopes of {best.name} explain {best.fill:.0%} of the ions about them, "
-                f"expected at least {1 - LARGEST_MISFIT:.0%}"
-            )
-        elif best.ions < _LEAST * counts.counts.sum():
-            reasons.append(f"no peaks of {formula}: {best.ions:,.0f} ions of {best.name} are too few to be named")
+        if lost := sorted(set(atoms_of_formula(formula)) & set(displaced)):
+            reasons.append(displaced[lost[0]])
+            continue
+        fit = explanation.fit
+        tried = [at for at, ion in enumerate(fit.ions) if ion is not None and ion.formula == formula]
+        tried = [at for at in tried if fit.possible(np.array([at]))[0]]
+        if not tried:
+            reasons.append(f"no peaks of {formula}: no peaks above the background where its isotopes should be")
+            continue
+        ions = [fit.contents.ions[fit.main[at]] / fit.largest[at] for at in tried]
+        best = tried[int(np.argmax(ions))]
+        if max(ions) < 5e-4 * fit.contents.ions.sum():
+            reasons.append(f"no peaks of {formula}: {max(ions):,.0f} ions of {fit.ions[best].name} are too few")
         else:
-            reasons.append(f"no peaks of {formula}: another ion explains the peaks of {best.name} better")
+            reasons.append(
+                f"no peaks of {formula}: the isotopes of {fit.ions[best].name} do not fit, or others fit better"
+            )
     return "; ".join(reasons)

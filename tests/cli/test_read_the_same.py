@@ -18,6 +18,7 @@ from apt_evap.workflows.twin_of_map import Twin, _Options
 
 pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # ions outside grids and ranges
 N = 20_000
+ABUNDANCES = (0.6808, 0.2622, 0.0114, 0.0363, 0.0093)  # of nickel
 # words of the file and of one option; all others are as if they were not given
 OPTIONS = {
     "format": ["ions.dat", "--format", ".epos"],
@@ -49,7 +50,8 @@ TOGETHER = [
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     random = np.random.default_rng(5)
-    mass = np.where(random.random(N) < 0.6, random.choice([28.97, 29.97], N, p=[0.72, 0.28]), random.uniform(5, 60, N))
+    nickel = random.choice(np.array([57.9353, 59.9308, 60.9311, 61.9283, 63.928]) / 2, N, p=ABUNDANCES)
+    mass = np.where(random.random(N) < 0.6, nickel, random.uniform(5, 60, N))
     mass = (mass * random.normal(1, 3e-4, N)).astype("f4")
     x, y = random.uniform(-3, 3, (2, N)).astype("f4")
     volts = np.linspace(4000, 5000, N).astype("f4")

@@ -688,7 +688,7 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     copper = (mass > 60).sum()
     opened.settle(lambda: page.maps.measured.ions is not None and page.maps.measured.ions <= copper)
     assert f"{len(page.explorer.measured):,} of 20,000 ions" in panel.told.text
-    assert len(panel.ranges.data["left"]) >= 2 and "Cu+" in panel.labels.data["label"] and panel.figure.visible
+    assert len(panel.ranges.data["left"]) >= 2 and "Cu⁺" in panel.labels.data["label"] and panel.figure.visible
     box = {"type": "rect", "x0": 13.0, "x1": 15.0, "y0": 1.0, "y1": 9.0}
     panel._dragged(SimpleNamespace(geometry=box, final=True))
     opened.settle(lambda: len(page.explorer.measured) == (mass < 15).sum() and "13 to 15 Da" in panel.told.text)
@@ -699,7 +699,7 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     opened.settle(lambda: len(page.explorer.measured) == 1000)
     panel._save()
     saved = ae.io.read_ranges("ions.rrng")
-    assert "Cu" in saved.species_names and len(saved) == len(panel.named.ranges)
+    assert "Cu" in saved.species_names and len(saved) == len(panel.named.ranges())
     (tmp_path / "ions.rrng").write_text("mine")
     panel._save()
     assert (tmp_path / "ions.rrng").read_text() == "mine" and panel.save.label == "replace ions.rrng"

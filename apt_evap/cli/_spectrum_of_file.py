@@ -1,0 +1,62 @@
+"""Mass spectrum of the ions of a file, by the options of a command."""
+
+import argparse
+from typing import Any
+
+from apt_evap.cli._options import add_flight, add_reading
+
+
+def add_spectrum(parser: argparse.ArgumentParser) -> None:
+    """Add the options of a spectrum."""
+    add_reading(parser)
+    parser.add_argument(
+        "--element",
+        metavar="NAME[,NAME]",
+        help="elements and ions that are expected, such as W or Cr,CrO; default: all elements are tried",
+    )
+    parser.add_argument(
+        "--isotope",
+        action="append",
+        metavar="NAME=A:SHARE[,A:SHARE]",
+        help="abundances of an enriched element, such as Si=28:0.5,30:0.5; may be repeated",
+    )
+    add_flight(parser)
+
+
+def abundances_of(texts: list[str] | None) -> dict[str, dict[int, float]] | None:
+    """Abundances by element and mass number of texts such as Si=28:0.5,30:0.5."""
+    enriched: dict[str, dict[int, float]] = {}
+    for text in texts or ():
+        element, equal, shares = text.partition("=")
+        try:
+            pairs = [part.split(":") for part in shares.split(",")]
+            enriched[element] = {int(number): float(share) for number, share in pairs}
+        except ValueError:
+            equal = ""
+        if not equal:
+            raise ValueError(f"--isotope must be NAME=A:SHARE[,A:SHARE] such as Si=28:0.5,30:0.5, got {text!r:.80}")
+    return enriched or None
+
+
+def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
+    """The spectrum of the ions of FILE that the options select, of all or only of the ions of ranges."""
+    from dataclasses import replace
+
+    from apt_evap.cli._files import file_of, read
+    from apt_evap.detection.hits import Hits
+    from apt_evap.spectra.mass_spectrum import spectrum
+
+    if options.mass is not None or options.species is not None:
+        raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
+    hits = read(options)
+    if not isinstance(hits, Hits):
+        raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
+    if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
+        raise ValueError(f"--distance is missing: {options.file!r} has no masses, and times of flight need it [mm]")
+    if ranges is not None and options.element is not None:
+        raise ValueError("--element and --ranges name the ions: expected one of them, got both")
+    elements = None if options.element is None else options.element.split(",")
+    flight = {"distance": options.distance, "time_zero": options.time_zero}
+    # ranges are not for a selection of ions; flight length and time zero are fitted
+    chosen = replace(file_of(options), ranges=None, distance=None)
+    return spectrum(chosen.select(hits), elements, ranges, abundances_of(options.isotope), **flight)

@@ -1,0 +1,118 @@
+"""Composition of a specimen in at.%, with errors of counting and the span over other names of the peaks."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+
+MOST_UNEXPLAINED = 0.1
+"""Part of the ions in peaks without an explanation, above which there is no composition."""
+
+
+@dataclass(frozen=True)
+class Composition:
+    """Atoms of each element, molecular ions taken apart, without the background.
+
+    Parameters
+    ----------
+    at_percent : dict of str to float
+        By element, the most frequent first [at.%]; empty if `refused`.
+    error : dict of str to float
+        Standard errors of counting, with that of the shape of the peaks [at.%].
+    span : dict of str to tuple of float
+        Lowest and highest value where peaks may have other names [at.%]; equal to the value if none has.
+    unexplained : float
+        Part of the ions in peaks that no ion explains.
+    refused : str
+        Why there is no composition; "" if there is one.
+    """
+
+    at_percent: dict[str, float]
+    error: dict[str, float]
+    span: dict[str, tuple[float, float]]
+    unexplained: float
+    refused: str = ""
+
+    def __getitem__(self, element: str) -> float:
+        return self.at_percent[element]
+
+    def __str__(self) -> str:
+        lines = [f"unexplained: {self.unexplained:.1%} of the ions in peaks"]
+        if self.refused:
+            return "\n".join([*lines, f"no composition: {self.refused}"])
+        for element, value in self.at_percent.items():
+            low, high = self.span[element]
+            error = self.error[element]
+            other = f" ({low:.2f} to {high:.2f} with other names)" if high - low > max(error, 0.005) else ""
+            lines.append(f"{element}: {value:.2f} ± {error:.2f} at.%{other}")
+        return "\n".join(lines)
+
+    def plain(self) -> dict[str, object]:
+        """As in the JSON of ``apt-evap composition``."""
+        shares = {e: {"at_percent": value, "error": self.error[e]} for e, value in self.at_percent.items()}
+        return {"composition": shares, "unexplained": self.unexplained}
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """Numbers of ions with their covariance.
+
+    Parameters
+    ----------
+    atoms : sequence of mapping
+        Atoms of each ion.
+    ions : ndarray
+        Number of ions, shape (n,).
+    covariance : ndarray
+        Of the numbers, shape (n, n).
+    others : sequence
+        Atoms and numbers of ions of other explanations.
+    """
+
+    atoms: Sequence[Mapping[str, int]]
+    ions: Floats
+    covariance: Floats
+    others: Sequence[tuple[Sequence[Mapping[str, int]], Floats]] = field(default=())
+
+    def composition(self, unexplained: float, refused: str = "") -> Composition:
+        """Composition of these ions; none where too much is unexplained."""
+        if not refused and unexplained > MOST_UNEXPLAINED:
+            refused = f"{unexplained:.0%} of the ions in peaks are unexplained, expected at most {MOST_UNEXPLAINED:.0%}"
+        numbers = _atoms_of(self.atoms, self.ions)
+        total = sum(numbers.values())
+        if not refused and not total > 0:
+            refused = "no ion has a name"
+        if refused:
+            return Composition({}, {}, {}, unexplained, refused)
+        share = {element: 100 * number / total for element, number in numbers.items()}
+        # derivatives of the shares by the numbers of ions
+        count = np.array([[atoms.get(element, 0) for atoms in self.atoms] for element in share], float)
+        slope = (100 * count - np.array(list(share.values()))[:, None] * count.sum(0)) / total
+        error = np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", slope, self.covariance, slope), 0))
+        errors = dict(zip(share, error.tolist(), strict=True))
+        span = {element: [value, value] for element, value in share.items()}
+        for atoms, ions in self.others:
+            other = _atoms_of(atoms, ions)
+            every = sum(other.values())
+            if every > 0:
+                for element, bounds in span.items():
+                    value = 100 * other.get(element, 0.0) / every
+                    bounds[:] = min(bounds[0], value), max(bounds[1], value)
+        order = sorted(share, key=lambda element: -share[element])
+        return Composition(
+            {element: share[element] for element in order},
+            {element: errors[element] for element in order},
+            {element: (span[element][0], span[element][1]) for element in order},
+            unexplained,
+        )
+
+
+def _atoms_of(atoms, ions):
+    """Number of atoms of each element."""
+    numbers: dict[str, float] = {}
+    for composition, number in zip(atoms, np.asarray(ions).tolist(), strict=True):
+        for element, count in composition.items():
+            numbers[element] = numbers.get(element, 0.0) + count * number
+    return {element: number for element, number in numbers.items() if number > 0}

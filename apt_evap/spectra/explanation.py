@@ -1,0 +1,370 @@
+"""The ions that explain all peaks of a spectrum together."""
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+from apt_evap.spectra.calibration_anchors import Point, find_anchors
+from apt_evap.spectra.candidate_ions import atomic_ions
+from apt_evap.spectra.ion_choice import IonChoice
+from apt_evap.spectra.ion_fit import LIGHT, IonFit
+from apt_evap.spectra.ion_names import GASES, Abundances, Ion, atoms_of_formula, element_of
+from apt_evap.spectra.mass_calibration import MassCalibration
+from apt_evap.spectra.peak_contents import Contents, PeakContents
+from apt_evap.spectra.peak_scale import HIGHEST, LOWEST
+
+_SHAPE = 0.02  # relative error of a content while ions are chosen: the shape of a peak
+_FINAL_SHAPE = 0.003  # relative error of a content where all peaks have an ion
+_WINDOWS = (0.005, 0.005, 0.004, 0.004)  # relative distance of peaks from their ions, in each round
+_MOST_IONS = (14, 24, 60, 60)
+_OWN_SHIFT = 5e-4  # of the peaks of an ion of its own, once the others have names
+_ALIKE = 30.0
+"""Chi-squared and costs by which another name of a peak may be worse: then both are named."""
+_POINT_ERROR = 1e-4  # least error of a point of the calibration
+_MOST_POINTS = 60
+_SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no other set is tried
+_ONE_LINE = 0.03  # of all ions, from which one line may show an element
+_KNOWN = 1e-3  # error of the calibration, below which it may
+_SPECIAL = ("D",)
+
+
+@dataclass
+class Explanation:
+    """Ions of a spectrum, and what they leave."""
+
+    contents: Contents
+    calibration: MassCalibration
+    fit: IonFit
+    chosen: list[int]
+    amplitudes: Floats
+    covariance: Floats
+    losses: Floats
+    """By how much chi-squared and costs rise without each ion."""
+    others: list[list[int]]
+    """Ions that could be in place of each."""
+    sets: list[tuple[list[int], Floats]] = field(default_factory=list)
+    """Other sets of ions that explain the peaks about as well, with their amplitudes."""
+    either: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Elements that could be in place of an element."""
+    perhaps: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Elements with one line only, which are not counted: m/n [Da] and ions."""
+
+    @property
+    def ions(self) -> list[Ion]:
+        """The ions."""
+        return [self.fit.ions[number] for number in self.chosen]  # type: ignore[misc]
+
+
+class Explainer:
+    """Search for the ions of a spectrum.
+
+    Parameters
+    ----------
+    peaks : PeakContents
+        The spectrum.
+    abundances : Abundances
+        Isotopes.
+    expected : sequence of str, optional
+        Formulas of ions that are expected; their elements cost nothing.
+    only : bool
+        Try only the elements of these. By default all elements are tried.
+    """
+
+    def __init__(
+        self, peaks: PeakContents, abundances: Abundances, expected: Sequence[str] = (), only: bool = False
+    ) -> None:
+        self.peaks, self.abundances, self.expected = peaks, abundances, expected
+        self._free = {name for text in expected for name in atoms_of_formula(text)}
+        self.allowed = self._free if only else None
+        self.calibration = MassCalibration()
+        self._anchors: list[Point] = []
+
+    def explain(self) -> Explanation:
+        """The ions, in four rounds: with each the calibration is better known."""
+        contents = self.peaks.fit()
+        if self.allowed is not None and not self.allowed:  # nothing is left to name
+            fit = IonFit(contents, self.peaks.scale, self.calibration, self.abundances, _SHAPE, _WINDOWS[-1])
+            none = np.zeros(0)
+            return Explanation(contents, self.calibration, fit, [], none, np.zeros((0, 0)), none, [])
+        choice = self._choice(contents, _WINDOWS[0])
+        ions = atomic_ions(choice.elements)
+        self._anchors = find_anchors(contents, self.peaks.scale, self.abundances, ions)
+        self.calibration.learn(self._anchors)
+        chosen: list[int] = []
+        amplitudes = np.zeros(0)
+        banned: set[str] = set()
+        banned_ions: set[Ion] = set()
+        perhaps: dict[str, tuple[float, float]] = {}
+        for number, window in enumerate(_WINDOWS):
+            if number == 2:
+                banned, perhaps = set(), {}
+            if number in (1, 2):
+                contents = self.peaks.fit(self._expected_places(contents, choice, chosen, amplitudes, window))
+            choice = self._choice(contents, window)
+            choice.banned, choice.banned_ions = banned, banned_ions
+            while True:
+                chosen, amplitudes, _ = choice.choose(_MOST_IONS[number])
+                if number < 2:
+                    break
+                if hydrides := self._hydrides(choice, chosen, amplitudes):
+                    banned_ions |= hydrides
+                    continue
+                unsure = self._unsure(choice, chosen, amplitudes)
+                if not unsure:
+                    break
+                banned |= set(unsure)
+                perhaps |= unsure
+            self._learn(choice, chosen, amplitudes, number)
+        sets, either = [], {}
+        if self.allowed is None:
+            chosen, sets, either = self._other_sets(choice, chosen, amplitudes)
+        return self._finished(choice, chosen, sets, either, perhaps)
+
+    def _choice(self, contents, window, shape_error=_SHAPE, own_shift=0.0):
+        fit = IonFit(
+            contents, self.peaks.scale, self.calibration, self.abundances, shape_error, window, own_shift
+        )  # fmt: skip
+        return IonChoice(fit, self.allowed, self.expected)
+
+    def _expected_places(self, contents, choice, chosen, amplitudes, window):
+        """Places where ions that are probable need a peak and none is seen [Da]."""
+        seen, scale = self.peaks.seen_at, self.peaks.scale
+        if not len(seen):
+            return np.zeros(0)
+        old = choice.fit
+        probable = []
+        for number in choice.candidates(chosen, amplitudes, every=True).tolist() + list(chosen):
+            ion = old.ions[number]
+            if ion is None:
+                continue
+            masses, shares = self.abundances.lines(ion.formula)
+            probable.append((masses / ion.charge, shares))
+        places = [self.calibration.place(masses) for masses, _ in probable]
+        needed = []
+        for place, (_, shares) in zip(places, probable, strict=True):
+            main = place[int(np.argmax(shares))]
+            distance = np.abs(np.log(seen / main))
+            near = int(np.argmin(distance))
+            if distance[near] <= max(window, 2 * float(scale.sigma(seen[near]))):
+                needed.append(
+                    place[(shares > 0.01 * shares.max()) & (place > 1.02 * LOWEST) & (place < 0.98 * HIGHEST)]
+                )
+        return self._without_peaks(np.concatenate(needed) if needed else np.zeros(0))
+
+    def _without_peaks(self, places):
+        """Those of some places [Da] that no peak and no other place is near."""
+        seen, scale, kept = self.peaks.seen_at, self.peaks.scale, []
+        for place in np.sort(places).tolist():
+            sigma = float(scale.sigma(place))
+            reach = 0.015 if place < LIGHT else max(2.5 * sigma, 1.5e-3)
+            if len(seen) and np.abs(np.log(seen / place)).min() < reach:
+                continue
+            if kept and math.log(place / kept[-1]) < 2.5 * sigma:
+                continue
+            kept.append(place)
+        return np.array(kept)
+
+    def _hydrides(self, choice, chosen, amplitudes):
+        """Hydrides of metals with more ions than the atoms of the metal: they are other ions."""
+        atomic: dict[str, float] = defaultdict(float)
+        ions = [(choice.fit.ions[number], x) for number, x in zip(chosen, amplitudes, strict=True)]
+        for ion, x in ions:
+            if ion is not None and choice.atoms[choice.fit.numbers([ion])[0]].sum() == 1:
+                atomic[ion.formula] += x
+        hydrides = set()
+        for ion, x in ions:
+            if ion is None or len(ion.atoms) != 2 or "H" not in ion.atoms or set(ion.atoms) <= {*GASES, "D"}:
+                continue
+            metal = next(name for name in ion.atoms if name != "H")
+            if x > atomic[metal] and ion.formula not in self.expected:
+                hydrides.add(ion)
+        return hydrides
+
+    def _unsure(self, choice, chosen, amplitudes):
+        """Elements without two lines of their atomic ions, and place and ions of the largest line."""
+        if self.allowed is not None:
+            return {}
+        fit = choice.fit
+        contents, total = fit.contents, fit.explained(chosen, amplitudes)
+        lines: dict[str, set[int]] = defaultdict(set)
+        largest: dict[str, tuple[float, float]] = {}
+        for number, x in zip(chosen, amplitudes, strict=True):
+            ion = fit.ions[number]
+            if ion is None or choice.atoms[number].sum() > 1:
+                continue
+            held = fit.shares[number] * x
+            clear = contents.seen & (held > 5 * np.sqrt(contents.variance))
+            clear &= held > 0.5 * np.maximum(total, contents.ions)
+            lines[ion.formula] |= set(np.flatnonzero(clear).tolist())
+            peak = int(np.argmax(held))
+            if held[peak] > largest.get(ion.formula, (0.0, 0.0))[1]:
+                largest[ion.formula] = float(contents.mass[peak]), float(held[peak])
+        unsure = {}
+        for at in np.flatnonzero(choice.atoms[np.asarray(chosen, int)].any(0)) if chosen else ():
+            name = choice.elements[at]
+            if element_of(name) in GASES or len(lines[name]) > 1 or name in self._free:
+                continue
+            place, ions = largest.get(name, (math.nan, 0.0))
+            known = ions > 0 and self.calibration.shift(place)[1][0] <= _KNOWN
+            if name in _SPECIAL and ions > 0 and len(self._lines_of(choice, chosen, amplitudes, name)) > 1:
+                continue  # deuterium has one atomic line: its molecules count
+            if ions < _ONE_LINE * contents.ions.sum() or not known:
+                unsure[name] = place, ions
+        return unsure
+
+    def _lines_of(self, choice, chosen, amplitudes, name):
+        """Peaks that the ions of an element explain for the most part."""
+        fit, lines = choice.fit, set()
+        for number, x in zip(chosen, amplitudes, strict=True):
+            if choice.atoms[number, choice.elements.index(name)]:
+                held = fit.shares[number] * x
+                clear = fit.contents.seen & (held > 5 * np.sqrt(fit.contents.variance))
+                lines |= set(np.flatnonzero(clear & (held > 0.5 * fit.contents.ions)).tolist())
+        return lines
+
+    def _learn(self, choice, chosen, amplitudes, number):
+        """Calibration from the peaks that one ion explains."""
+        fit, contents = choice.fit, choice.fit.contents
+        total, points = fit.explained(chosen, amplitudes), []
+        for column, x in zip(chosen, amplitudes, strict=True):
+            ion = fit.ions[column]
+            if ion is None or (choice.atoms[column].sum() > 2 and number < 2):
+                continue
+            held = x * fit.shares[column]
+            clear = contents.seen & (contents.mass > LIGHT) & (contents.ions > 200)
+            masses = self.abundances.lines(ion.formula)[0] / ion.charge
+            places = self.calibration.place(masses)
+            for peak in np.flatnonzero(clear & (held > 0.85 * np.maximum(total, contents.ions)) & (held > 0)):
+                mass = float(masses[np.argmin(np.abs(np.log(places / contents.mass[peak])))])
+                weight = min(math.sqrt(contents.ions[peak]), 100.0)
+                points.append((weight, mass, float(contents.mass[peak]) / mass - 1))
+        noise = max(_POINT_ERROR, 0.08 * self.peaks.scale.width)
+        new, used = MassCalibration(), list(self._anchors)
+        new.learn(used)
+        for weight, mass, shift in sorted(points, reverse=True):
+            mean, error = (float(values[0]) for values in new.shift(mass))
+            if abs(shift - mean) < 3 * math.hypot(error, noise):
+                used.append((mass, shift, max(noise, 3e-3 / max(weight, 1.0))))
+                new.learn(used)
+            if len(used) > _MOST_POINTS:
+                break
+        self.calibration = new
+        rest = [shift - float(new.shift(mass)[0][0]) for mass, shift, _ in used] or [1e-4]
+        new.scatter = float(np.clip(1.48 * np.median(np.abs(rest)), 5e-5, 1e-3))
+
+    def _other_sets(self, choice, chosen, amplitudes):
+        """Exchange all ions of an element against the best ions without it."""
+        fit, contents = choice.fit, choice.fit.contents
+        sets, either = [], {}
+        names = [choice.elements[at] for at in np.flatnonzero(choice.atoms[chosen].any(0))] if chosen else []
+        for name in sorted(set(names) - set(GASES)):
+            at = choice.elements.index(name)
+            if not choice.atoms[chosen][:, at].any():
+                continue
+            amplitudes, _ = fit.solve(chosen)
+            lines = sum(
+                np.count_nonzero(fit.shares[number] * x > 5 * np.sqrt(contents.variance))
+                for number, x in zip(chosen, amplitudes, strict=True)
+                if choice.atoms[number, at] == choice.atoms[number].sum() == 1
+            )
+            if lines > _SURE_LINES:
+                continue
+            choice.banned = choice.banned | {name}
+            start = [number for number in chosen if not choice.atoms[number, at]]
+            others, other_amplitudes, _ = choice.choose(14, start)
+            choice.banned = choice.banned - {name}
+            without, before = choice.value(others), choice.value(chosen)
+            elements = [set(np.flatnonzero(choice.atoms[numbers].any(0)).tolist()) for numbers in (others, chosen)]
+            new = tuple(choice.elements[number] for number in sorted(elements[0] - elements[1]))
+            unnamed = [sum(fit.ions[number] is None for number in numbers) for numbers in (others, chosen)]
+            if without < before and not self._unsure(choice, others, other_amplitudes):
+                chosen = others
+            elif without < before + _ALIKE and unnamed[0] <= unnamed[1]:
+                sets.append(([n for n in others if fit.ions[n] is not None], name))
+                if new:
+                    either[name] = new
+        # only sets that exchange an element of the last choice
+        kept = [(others, name) for others, name in sets if choice.atoms[chosen][:, choice.elements.index(name)].any()]
+        return chosen, [[fit.ions[number] for number in others] for others, _ in kept], either
+
+    def _finished(self, choice, chosen, sets, either, perhaps):
+        """Ions with small shifts of their own, contents with the places of these ions only, errors, alternatives."""
+        ions = [choice.fit.ions[number] for number in chosen if choice.fit.ions[number] is not None]
+        contents = choice.fit.contents
+        banned, banned_ions = choice.banned, choice.banned_ions
+        choice = self._choice(contents, _WINDOWS[-1], own_shift=_OWN_SHIFT)
+        choice.banned, choice.banned_ions = banned, banned_ions
+        chosen = self._with_shifted(choice, choice.numbers(ions).tolist())
+        ions = [choice.fit.ions[number] for number in chosen]
+        amplitudes, _ = choice.fit.solve(chosen)
+        places = [
+            self.calibration.place(masses / ion.charge)[x * shares >= 30]
+            for ion, x in zip(ions, amplitudes, strict=True)
+            for masses, shares in [self.abundances.lines(ion.formula)]
+        ]
+        contents = self.peaks.fit(self._without_peaks(np.concatenate(places) if places else np.zeros(0)))
+        choice = self._choice(contents, _WINDOWS[-1], own_shift=_OWN_SHIFT)
+        choice.banned, choice.banned_ions = banned, banned_ions
+        chosen = choice.numbers(ions).tolist()
+        amplitudes, chi2 = choice.fit.solve(chosen)
+        choice.learn_shares(chosen, amplitudes)
+        chosen, amplitudes, value = choice.pruned(chosen, amplitudes, chi2 + choice.cost(chosen))
+        kept = [number for number, x in zip(chosen, amplitudes, strict=True) if x > 0]
+        fit = choice.fit
+        losses = [fit.solve(r)[1] + choice.cost(r) - value for r in ([n for n in kept if n != m] for m in kept)]
+        final, covariance = self.amounts(fit, kept)
+        explanation = Explanation(
+            contents, self.calibration, fit, kept, final, covariance, np.array(losses), [], [], either, perhaps
+        )  # fmt: skip
+        tried = choice.candidates(kept, amplitudes)
+        for number in kept:
+            others = []
+            for total, other, _, rest in choice.replacements(kept, number, tried, value + _ALIKE):
+                if total < value + _ALIKE:
+                    others.append((total, other))
+                    explanation.sets.append(([*rest, other], self.amounts(fit, [*rest, other])[0]))
+            explanation.others.append([other for _, other in sorted(others)[:3]])
+        for others in sets:
+            numbers = choice.numbers(others).tolist()
+            explanation.sets.append((numbers, self.amounts(fit, numbers)[0]))
+        return explanation
+
+    def _with_shifted(self, choice, chosen):
+        """Further ions of known elements, whose peaks lie beside the smooth calibration."""
+        fit, contents = choice.fit, choice.fit.contents
+        amplitudes, chi2 = fit.solve(chosen)
+        choice.learn_shares(chosen, amplitudes)
+        value = chi2 + choice.cost(chosen)
+        sure = choice.atoms[np.asarray(chosen, int)].any(0) if chosen else np.zeros(len(choice.elements), bool)
+        for _ in range(6):
+            rest = np.where(contents.seen, np.maximum(contents.ions - fit.explained(chosen, amplitudes), 0), 0.0)
+            tried = choice.candidates(chosen, amplitudes)
+            tried = tried[~(choice.atoms[tried][:, ~sure] > 0).any(1)]
+            main = fit.main[tried]
+            least = np.maximum(0.5 * contents.ions[main], 1e-4 * contents.ions.sum())
+            tried, best = tried[rest[main] >= least], None
+            for number in tried.tolist():
+                trial, chi2 = fit.solve([*chosen, number])
+                total = chi2 + choice.cost([*chosen, number]) + 20
+                if total < value and (best is None or total < best[0]):
+                    best = total, [*chosen, number], trial
+            if best is None:
+                break
+            value, chosen, amplitudes = best
+            value -= 20
+        return chosen
+
+    def amounts(self, fit: IonFit, chosen: Sequence[int]) -> tuple[Floats, Floats]:
+        """Ions of each of some ions with their covariance, from the contents alone, with the errors of counting."""
+        from scipy.optimize import nnls
+
+        if not len(chosen):
+            return np.zeros(0), np.zeros((0, 0))
+        contents = fit.contents
+        error = np.sqrt(contents.variance + (_FINAL_SHAPE * contents.ions) ** 2)
+        system = (fit.shares[np.asarray(chosen, int)] / error).T
+        return nnls(system, contents.ions / error)[0], np.linalg.pinv(system.T @ system)

@@ -1,0 +1,186 @@
+"""Numbers of ions in the peaks of a spectrum: all peaks and the background at once, by their likelihood."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap.spectra.peak_scale import BINS, HIGHEST, LOWEST, PeakScale, find_places
+
+_SHORT, _LONG = 30 * BINS, 110 * BINS  # bins of a peak on both sides of its place; the long tail is at high masses
+_TAILS = (0.0, 1.5, 4.0, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
+_LONGEST = 0.014  # of ln m/n at 30 Da: longer tails are not of one peak
+_TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
+_MIXTURE = ((0.6, 0.2, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
+_STRONG = 3000  # ions of a peak that has a mixture of tails of its own
+_BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
+_NEIGHBOURS = 0.10  # relative error of the tails of other peaks below a peak
+_ROUNDS, _ITERATIONS = 3, 120
+CORE = 2 * BINS
+"""Half width of the core of a peak [bins]: the error of its content is that of the counts there."""
+
+
+class Contents(NamedTuple):
+    """Peaks of a spectrum, and places where ions are expected."""
+
+    mass: Floats
+    """m/n [Da], shape (n,), increasing."""
+    seen: Booleans
+    """Whether a peak is there, and not only an expected one."""
+    ions: Floats
+    """Number of ions."""
+    variance: Floats
+    """Variance of the number of ions: counts of the core, and tails of the neighbours."""
+    background: Floats
+    """Background in each bin of the scale."""
+    shapes: Floats
+    """Shape of each peak, shape (n, bins)."""
+
+    @property
+    def total(self) -> float:
+        """Ions in all peaks that are seen."""
+        return float(self.ions[self.seen].sum())
+
+
+class PeakContents:
+    """Likelihood fit of peaks of one learnt shape on a smooth background.
+
+    Parameters
+    ----------
+    mass : ndarray
+        m/n of the ions [Da], between `LOWEST` and `HIGHEST`.
+    """
+
+    def __init__(self, mass: Floats) -> None:
+        self.scale = PeakScale(mass)
+        self.counts = self.scale.counts(mass)
+        self.places, self._smooth = find_places(self.counts)
+        self.seen_at = self.scale.mass(self.places) if len(self.places) else np.zeros(0)
+        """m/n of the peaks [Da]."""
+        self._tails, self._bases = _bases(self.scale)
+        self._left = _SHORT
+        if self.scale.mirrored:
+            self._bases, self._left = self._bases[:, ::-1], _LONG
+        self._smooth_background = _background_basis(self.scale)
+        self._mixture = np.array([*_MIXTURE[0][: len(self._tails)], *_MIXTURE[1]])
+        self._start: Floats | None = None  # amplitudes of the background of the last fit
+
+    def fit(self, expected: Floats | None = None, rounds: int = _ROUNDS) -> Contents:
+        """Numbers of ions at the peaks, and at further places where ions are expected [Da]."""
+        more = np.zeros(0) if expected is None else np.asarray(expected, float)
+        mass = np.concatenate([self.seen_at, more])
+        seen = np.arange(len(mass)) < len(self.seen_at)
+        order = np.argsort(mass, kind="stable")
+        mass, seen = mass[order], seen[order]
+        place = np.clip(self.scale.bins(mass), 0, self.scale.size - 1)
+        height = self._smooth[np.rint(place).astype(int)]
+        # strong peaks have tails of their own, from which the shape of the others is learnt
+        near = np.array([height[np.abs(place - centre) < 60 * BINS].max() for centre in place])
+        strong = seen & (height > 0.03 * near) & (height * BINS * 2.5 > _STRONG)
+        mixture = self._mixture / self._mixture.sum()
+        for number in range(rounds):
+            last = number == rounds - 1
+            iterations = _ITERATIONS if last else _ITERATIONS // 3
+            ions, shares, below = self._maximise(place, height, strong, mixture, iterations)
+            if strong.any():
+                weights = np.sqrt(ions[strong])
+                mixture = np.maximum((shares[strong] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
+                mixture /= mixture.sum()
+        self._mixture = mixture
+        shapes = np.where(strong[:, None], shares, mixture) @ self._bases
+        return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes)
+
+    def _maximise(self, place, height, strong, mixture, iterations):
+        """Ions and shares of the tails of each peak, and the background, by expectation and maximisation."""
+        from scipy.sparse import hstack
+
+        owner = np.repeat(np.arange(len(place)), np.where(strong, len(self._bases), 1))
+        first = np.concatenate([[True], owner[1:] != owner[:-1]]) if len(owner) else np.zeros(0, bool)
+        kind = np.arange(len(owner)) - np.maximum.accumulate(np.where(first, np.arange(len(owner)), 0))
+        kinds = np.where(strong[owner], kind, len(self._bases))
+        peaks = self.columns(place[owner], np.vstack([self._bases, mixture @ self._bases])[kinds])
+        every = hstack([peaks, self._smooth_background]).tocsc()
+        transposed, norm = every.T, np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
+        amplitudes = np.empty(every.shape[1])
+        share = np.append(mixture, 1.0)[kinds]
+        amplitudes[: len(owner)] = np.maximum(height * BINS * 2.6, 1.0)[owner] * share
+        if self._start is None:
+            self._start = np.full(self._smooth_background.shape[1], np.percentile(self.counts, 30) / 2 + 1e-3)
+            self._start /= max(float(np.median(np.asarray(self._smooth_background.sum(1)).ravel())), 1e-9)
+        amplitudes[len(owner) :] = np.maximum(self._start, 1e-6 * self._start.max() + 1e-12)
+        for _ in range(iterations):
+            amplitudes *= (transposed @ (self.counts / (every @ amplitudes + 1e-9))) / norm
+        self._start = amplitudes[len(owner) :].copy()
+        of_kind = np.zeros((len(place), len(self._bases)))
+        own = kinds < len(self._bases)
+        of_kind[owner[own], kinds[own]] = amplitudes[: len(owner)][own]
+        ions = np.bincount(owner, amplitudes[: len(owner)], minlength=len(place))
+        shares = of_kind / np.maximum(of_kind.sum(1, keepdims=True), 1e-9)
+        return ions, shares, self._smooth_background @ amplitudes[len(owner) :]
+
+    def columns(self, place: Floats, shapes: Floats) -> Any:
+        """Sparse matrix of shapes of peaks at places [bins], shape (size, n)."""
+        from scipy.sparse import csc_matrix
+
+        low = np.floor(place).astype(int)
+        part = (place - low)[:, None]
+        values = shapes * (1 - part)
+        values[:, 1:] += shapes[:, :-1] * part
+        rows = low[:, None] + np.arange(-self._left, shapes.shape[1] - self._left)
+        inside = (rows >= 0) & (rows < self.scale.size) & (values > 0)
+        ends = np.concatenate([[0], np.cumsum(inside.sum(1))])
+        return csc_matrix((values[inside], rows[inside], ends), shape=(self.scale.size, len(place)))
+
+    def between(self, shape: Floats, bounds: Floats) -> Floats:
+        """Part of a shape between bounds relative to its place [bins], of shape (2, n)."""
+        sums = np.pad(np.cumsum(shape), (1, 0))
+        low, high = np.interp(bounds + self._left + 0.5, np.arange(len(sums)), sums)
+        return high - low
+
+    def _variance(self, place, ions, shapes, below, mixture):
+        """Variance of contents: the counts of the core, tails of the neighbours, and four ions."""
+        model = self.columns(place, shapes) @ ions + below
+        core = float((mixture @ self._bases)[self._left - CORE : self._left + CORE + 1].sum())
+        sums, sums_below = (np.pad(np.cumsum(values), (1, 0)) for values in (model, below))
+        middle = np.floor(place).astype(int)
+        low = np.clip(middle - CORE, 0, self.scale.size)
+        high = np.clip(middle + CORE + 1, 0, self.scale.size)
+        every, of_background = sums[high] - sums[low], sums_below[high] - sums_below[low]
+        others = np.maximum(every - of_background - ions * core, 0)
+        core = max(core, 0.3)
+        return np.maximum(every, 1) / core**2 + (_NEIGHBOURS * others / core) ** 2 + 4.0
+
+
+def _bases(scale):
+    """Lengths of the tails to high masses, and shapes of peaks: normal, with each of the tails, shape (k, bins)."""
+    from scipy.special import ndtr
+
+    size = _SHORT + _LONG + 1
+    edges = (np.arange(-_SHORT, _LONG + 2) - 0.5) / BINS
+    tails = [length for length in _TAILS if length * float(scale.sigma(30.0)) < _LONGEST]
+    normal = np.diff(ndtr(edges))
+    mirrored = np.diff(ndtr((np.arange(-_LONG, _SHORT + 2) - 0.5) / BINS))
+    shapes = []
+    for length, core in [(t, normal) for t in tails] + [(t, mirrored) for t in _TAILS_BEFORE]:
+        shape = core
+        if length:
+            decay = np.exp(-np.arange(size) / (BINS * length))
+            shape = np.convolve(core, decay / decay.sum())[:size]
+        shapes.append(shape if core is normal else shape[::-1])
+    bases = np.array(shapes)
+    bases[bases < 1e-7] = 0
+    return tails, bases
+
+
+def _background_basis(scale):
+    """Sparse matrix of cubic splines in ln m/n, times a density that is constant in time of flight."""
+    from scipy.interpolate import BSpline
+    from scipy.sparse import diags
+
+    logs = np.log(np.clip(scale.centres, LOWEST, HIGHEST))
+    first, last = math.log(LOWEST), math.log(HIGHEST)
+    inner = np.linspace(first, last, math.ceil((last - first) / _BACKGROUND_STEP) + 1)
+    knots = np.concatenate([[first] * 3, inner, [last] * 3])
+    splines = BSpline.design_matrix(logs, knots, 3)
+    return (diags(np.gradient(np.log(scale.centres)) * np.sqrt(scale.centres)) @ splines).tocsc()

@@ -1,0 +1,146 @@
+"""Scale of m/n on which all peaks of a spectrum have the same width, and the peaks on it."""
+
+import math
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+
+LOWEST, HIGHEST = 0.5, 310.0
+"""m/n [Da] of the ions that a spectrum may contain."""
+BINS = 3
+"""Bins of a histogram per standard deviation of a peak."""
+_STEP = 1e-4  # of ln m/n, of the histogram in which widths are measured
+_STRONGEST = 30  # peaks whose widths are measured
+_FEWEST = 60  # ions of one half of such a peak
+_WIDTHS = (1e-4, 5e-3)  # of ln m/n; standard deviations are between these
+_MIRRORED = 0.3  # mean logarithm of the left width over the right one, from which tails are at low masses
+_NOMINAL = 5e-4  # width without a peak
+_PROMINENCE = 5.0  # of a peak, in standard deviations of counting
+_APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
+
+
+class PeakScale:
+    """Coordinate of m/n in units of the standard deviation of a peak, sigma(ln m) = width m^power.
+
+    Parameters
+    ----------
+    mass : ndarray
+        m/n of the ions [Da], between `LOWEST` and `HIGHEST`.
+
+    Attributes
+    ----------
+    mirrored : bool
+        Whether peaks have their tails at low masses, as where ions fly longer than the voltage says.
+    """
+
+    def __init__(self, mass: Floats) -> None:
+        self.width, self.power, self.mirrored = _widths(mass)
+        self._first = float(self._coordinate(LOWEST))
+        self.size = int((float(self._coordinate(HIGHEST)) - self._first) * BINS) + 1
+        self.centres = self.mass(np.arange(self.size, dtype=float))
+        """m/n at the middle of the bins [Da]."""
+
+    def sigma(self, mass: Floats | float) -> Floats:
+        """Standard deviation of ln m/n of a peak."""
+        return self.width * np.asarray(mass, float) ** self.power
+
+    def _coordinate(self, mass):
+        mass = np.asarray(mass, float)
+        if abs(self.power) < 1e-9:
+            return np.log(mass) / self.width
+        return mass**-self.power / (-self.power * self.width)
+
+    def bins(self, mass: Floats) -> Floats:
+        """Place of m/n in bins, whole numbers at their middles."""
+        return (self._coordinate(mass) - self._first) * BINS - 0.5
+
+    def mass(self, bins: Floats) -> Floats:
+        """The inverse of `bins` [Da]."""
+        place = self._first + (np.asarray(bins, float) + 0.5) / BINS
+        if abs(self.power) < 1e-9:
+            return np.exp(place * self.width)
+        return (-place * self.power * self.width) ** (-1 / self.power)
+
+    def counts(self, mass: Floats) -> Floats:
+        """Number of ions in each bin, shape (size,)."""
+        rows = np.rint(self.bins(mass)).astype(np.int64)
+        return np.bincount(np.clip(rows, 0, self.size - 1), minlength=self.size).astype(float)
+
+
+def _widths(mass):
+    """Width and power of the standard deviation of ln m/n, and whether peaks are sharper at high masses."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import find_peaks
+
+    edges = np.arange(math.log(LOWEST), math.log(HIGHEST), _STEP)
+    counts = np.bincount(((np.log(mass) - edges[0]) / _STEP).astype(int), minlength=len(edges)).astype(float)
+    smooth = gaussian_filter1d(counts, 1.5)
+    # the square root of counts has the same noise everywhere; 5.3 bins are effectively in the filter
+    tops, found = find_peaks(2 * np.sqrt(5.3 * smooth + 0.375), prominence=12, distance=20)
+    tops = tops[np.argsort(-found["prominences"])[:_STRONGEST]].tolist()
+    left, right = ([_half_width(smooth, counts, top, step) for top in tops] for step in (-1, 1))
+    both = [(math.log(low / high), smooth[top]) for low, high, top in zip(left, right, tops, strict=True) if low * high]
+    mirrored = bool(both) and sum(ratio * math.sqrt(height) for ratio, height in both) > _MIRRORED * sum(
+        math.sqrt(height) for _, height in both
+    )
+    sides = zip(right if mirrored else left, tops, strict=True)
+    rows = [(width, edges[top], min(math.sqrt(smooth[top]), 50.0)) for width, top in sides if width]
+    if not rows:
+        return _NOMINAL, 0.0, False
+    logs, at, weight = np.array(rows).T
+    logs = np.log(logs)
+    if len(logs) < 3:
+        return float(np.clip(math.exp(np.median(logs)), *_WIDTHS)), 0.0, mirrored
+    best = math.inf, 0.0, 0.0
+    for power in np.arange(-0.6, 0.21, 0.1):  # sqrt(m) for errors of the time, m^0 for those of the energy
+        rest = logs - power * at
+        order = np.argsort(rest)
+        middle = rest[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)]
+        cost = float((weight * np.abs(rest - middle)).sum() + 0.02 * abs(power) * weight.sum())
+        best = min(best, (cost, float(power), float(middle)))
+    return float(np.clip(math.exp(best[2]), *_WIDTHS)), best[1], mirrored
+
+
+def _half_width(smooth, counts, top, step):
+    """Standard deviation of ln m/n of one side of a peak, 0 if it has none."""
+    half, at = smooth[top] / 2, top
+    last = min(max(top + 150 * step, 0), len(smooth) - 1)
+    while at != last and smooth[at] > half:
+        at += step
+    side = counts[at:top] if step < 0 else counts[top + 1 : at + 1]
+    if at == last or side.sum() < _FEWEST:
+        return 0.0
+    within = (smooth[at - step] - half) / max(smooth[at - step] - smooth[at], 1e-9)
+    half_width = (abs(top - at) - 1 + within) * _STEP
+    return math.sqrt(max((half_width / math.sqrt(2 * math.log(2))) ** 2 - (1.5 * _STEP) ** 2, (0.8e-4) ** 2))
+
+
+def find_places(counts: Floats) -> tuple[Floats, Floats]:
+    """Places of the peaks of a histogram in bins, and the histogram smoothed by the width of a peak."""
+    from scipy.ndimage import gaussian_filter1d
+    from scipy.signal import find_peaks
+
+    smooth = gaussian_filter1d(counts, float(BINS))
+    tops, _ = find_peaks(2 * np.sqrt(smooth * 2 * math.sqrt(math.pi) * BINS + 0.375), prominence=_PROMINENCE)
+    kept: list[int] = []
+    for top in tops.tolist():
+        if kept and top - kept[-1] < _APART * BINS:
+            if smooth[top] > smooth[kept[-1]]:
+                kept[-1] = top
+            continue
+        kept.append(top)
+    return np.array([_centroid(counts, top) for top in kept]), smooth
+
+
+def _centroid(counts, top):
+    """Centre of gravity of the middle of a peak [bins]."""
+    place = float(top)
+    for _ in range(4):
+        low = max(round(place - 1.2 * BINS), 0)
+        high = min(round(place + 1.2 * BINS) + 1, len(counts))
+        weights = np.maximum(counts[low:high] - 0.8 * min(counts[low], counts[high - 1]), 0) + 1e-9
+        place = float(weights @ np.arange(low, high) / weights.sum())
+        if not 0 <= place < len(counts):
+            return float(top)
+    return place if abs(place - top) < 2 * BINS else float(top)

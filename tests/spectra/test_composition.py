@@ -1,0 +1,185 @@
+"""Composition of made spectra: true ions and at.% are found, absent ones are not, and what is unexplained is said."""
+
+import json
+
+import numpy as np
+import pytest
+from made_spectra import distance, made, truth
+
+import apt_evap as ae
+from apt_evap.cli.main import main
+from apt_evap.io.formats import read_ranges
+from apt_evap.spectra.composition import Amounts
+from apt_evap.spectra.ion_names import ion_name
+
+ALLOYS = {
+    "CoCrFeMnNi": {(e, q): share for e in ("Co", "Cr", "Fe", "Mn", "Ni") for q, share in ((2, 16), (1, 4))},
+    "cementite": {("Fe", 2): 60, ("Fe", 1): 5, ("C", 2): 5, ("C", 1): 7, ("C2", 1): 3, ("C3", 1): 3, ("C3", 2): 2},
+    "GaN": {("Ga", 2): 20, ("Ga", 1): 30, ("N", 1): 15, ("N2", 1): 12, ("N", 2): 1, ("GaN", 1): 1},
+    "UO2": {("UO2", 2): 30, ("UO", 2): 20, ("U", 2): 5, ("U", 3): 5, ("UO2", 1): 10, ("O", 1): 10, ("O2", 1): 5},
+    "D2O": {("D", 1): 8, ("D2", 1): 6, ("OD", 1): 10, ("D2O", 1): 30, ("D3O", 1): 40, ("O", 1): 3, ("W", 3): 20},
+    "VH": {("V", 2): 60, ("V", 3): 20, ("H", 1): 8, ("H2", 1): 4},
+}
+
+
+@pytest.mark.parametrize("name", ALLOYS)
+@pytest.mark.parametrize("blind", [True, False])
+def test_ions_and_at_percent_of_an_alloy(name, blind):
+    """Measured: the sum of differences is 0.1 to 0.3 at.% for 60,000 ions, where counting alone gives 0.2."""
+    ions, expected = ALLOYS[name], truth(ALLOYS[name])
+    result = ae.spectrum(made(ions), None if blind else list(expected))
+    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+    assert result.unexplained_part < 0.005 and not result.composition.refused
+    assert distance(result.composition, expected) < 0.8
+    for element, value in expected.items():
+        assert abs(result.composition[element] - value) < 4 * result.composition.error[element] + 0.05
+
+
+def test_charges_of_the_made_ions_are_counted():
+    ions = ALLOYS["cementite"]
+    result = ae.spectrum(made(ions))
+    for ion in result.ions:
+        expected = 60_000 * ions[ion.formula, ion.charge] / sum(ions.values())
+        assert abs(ion.ions - expected) < 4 * np.hypot(ion.error, 0.01 * expected)
+    assert {"C₂⁺", "C²⁺", "C₃²⁺"} <= {ion.name for ion in result.ions}
+
+
+def test_an_unexplained_spectrum_has_no_composition():
+    """Silicon of two equal isotopes is no element of the table, until its abundances are given."""
+    enriched = {"Si": {28: 0.5, 30: 0.5}}
+    hits = made({("Si", 2): 9, ("Si", 1): 1}, isotopes=enriched)
+    blind = ae.spectrum(hits)
+    assert blind.composition.at_percent == {} and blind.unexplained_part > 0.3
+    assert str(blind).startswith("unexplained: ") and "no composition: " in str(blind)
+    told = ae.spectrum(hits, isotopes=enriched)
+    assert told.composition.at_percent == {"Si": 100.0} and told.unexplained_part < 0.01
+    assert [ion.name for ion in ae.spectrum(made({("28Si", 1): 1}), "28Si").ions] == ["²⁸Si⁺"]
+
+
+def test_a_peak_that_is_of_none_of_the_elements_is_said():
+    result = ae.spectrum(made({("Al", 1): 90, ("Au", 1): 5}), "Al")
+    (peak,) = result.unexplained
+    assert peak.mass == pytest.approx(197.2, abs=0.2) and peak.ions == pytest.approx(60_000 * 5 / 95, rel=0.05)
+    assert result.unexplained_part == pytest.approx(5 / 95, rel=0.05)
+
+
+def test_hydrogen_molecules_may_be_deuterium():
+    ions = {("V", 2): 80, ("H", 1): 8, ("H2", 1): 4}
+    (hydrogen,) = [ion for ion in ae.spectrum(made(ions)).ions if ion.name == "H₂⁺"]
+    assert "D⁺" in hydrogen.others
+
+
+def test_the_composition_of_a_region_is_its_own():
+    """Two halves with 20 and 5 % of chromium, and one of 300 ions: within three errors in 20 of 20 draws."""
+    rich, poor = made({("Fe", 2): 80, ("Cr", 2): 20}), made({("Fe", 2): 95, ("Cr", 2): 5}, seed=2)
+    mass = np.append(rich.mass_to_charge, poor.mass_to_charge)
+    result = ae.spectrum(ae.Hits(mass_to_charge=mass))
+    first = np.arange(len(mass)) < len(rich)
+    for selection, expected in ((first, 20), (~first, 5), (np.arange(len(mass)) < 300, 20)):
+        part = result.composition_of(selection)
+        assert abs(part["Cr"] - expected) < 3 * part.error["Cr"] + 0.05
+        assert part["Fe"] + part["Cr"] == pytest.approx(100)
+    assert 1 < result.composition_of(np.arange(len(mass)) < 300).error["Cr"] < 4
+    again = result.composition_of(result.hits)
+    assert again["Cr"] == pytest.approx(result.composition["Cr"], abs=0.1)
+    with pytest.raises(ValueError, match="selection must have shape"):
+        result.composition_of([True])
+
+
+def test_errors_follow_from_counting():
+    """Ions of two elements: the error of the share p of n ions is that of a binomial, sqrt(p (1 - p) / n)."""
+    composition = Amounts([{"A": 1}, {"B": 1}], np.array([300.0, 100.0]), np.diag([300.0, 100.0])).composition(0.0)
+    assert composition.error["A"] == pytest.approx(100 * np.sqrt(0.75 * 0.25 / 400))
+    molecules = Amounts([{"A": 1, "O": 2}], np.array([50.0]), np.array([[50.0]])).composition(0.0)
+    assert molecules["O"] == pytest.approx(200 / 3) and molecules.error["O"] == pytest.approx(0, abs=1e-9)
+    assert Amounts([{"A": 1}], np.array([1.0]), np.eye(1)).composition(0.101).refused
+
+
+def test_ranges_count_only_their_ions_and_name_those_they_do_not_explain():
+    hits = made({("Ni", 1): 70, ("Si", 2): 20, ("Al", 1): 10})
+    low, high = np.array([[13.9, 14.15], [26.9, 27.2], [57.8, 58.3], [59.8, 60.3], [60.8, 61.3]]).T
+    atoms = [{"Si": 1}, {"Al": 1}, *[{"Cr": 2, "O": 1}] * 3]
+    ranges = ae.spectra.Ranges(("Si", "Al", "Cr2O", "Cr2O", "Cr2O"), low, high, composition=atoms)
+    result = ae.spectrum(hits, ranges=ranges)
+    assert {ion.formula for ion in result.ions} == {"Si", "Al", "Cr2O"}
+    assert {misfit.name for misfit in result.misfits} == {"Cr2O"} and result.unexplained_part > 0.3
+    assert "no composition" in str(result)
+    right = ae.spectra.Ranges(
+        ("Si", "Al", "Ni", "Ni", "Ni"), low, high, composition=[{"Si": 1}, {"Al": 1}, *[{"Ni": 1}] * 3]
+    )
+    result = ae.spectrum(hits, ranges=right)
+    # the ranges end before the tails do: alike for all ions, but not with the heavier ones of silicon
+    assert distance(result.composition, {"Ni": 70, "Si": 20, "Al": 10}) < 1.0 and not result.misfits
+    with pytest.raises(ValueError, match=r"^ranges must contain isotopes of their ions"):
+        ae.spectrum(hits, ranges=ae.spectra.Ranges(("W",), [1.0], [2.0], composition=[{"W": 1}]))
+    with pytest.raises(ValueError, match=r"got both"):
+        ae.spectrum(hits, "Ni", ranges)
+
+
+def test_saved_ranges_give_the_same_composition(tmp_path):
+    ions = {("Fe", 2): 70, ("Cr", 2): 25, ("FeO", 1): 5}
+    hits = made(ions)
+    result = ae.spectrum(hits)
+    ae.io.write_rrng(tmp_path / "a.rrng", result.ranges())
+    ranges = read_ranges(tmp_path / "a.rrng")
+    counted = ranges.count_atoms(hits)
+    share = {name: 100 * number / sum(counted.values()) for name, number in counted.items()}
+    for name, value in truth(ions).items():
+        assert share[name] == pytest.approx(value, abs=0.7)  # counted with background, and without all tails
+    # measured 1.3: 54Fe and 54Cr share a range, whose ions are known to 1 % (its bounds and the shape of the peaks)
+    assert distance(ae.spectrum(hits, ranges=ranges).composition, truth(ions)) < 2.0
+
+
+@pytest.mark.parametrize("number", [100, 30])
+def test_few_ions_have_no_composition_and_it_is_said(number):
+    rng = np.random.default_rng(1)
+    hits = ae.Hits(mass_to_charge=26.98 * rng.normal(1, 4e-4, number))
+    assert f"{number} ions are too few" in ae.spectrum(hits).composition.refused
+
+
+@pytest.mark.parametrize(
+    ("isotopes", "sentence"),
+    [
+        ({"Si": {28: 0.5, 30: 0.4}}, "abundances of Si must sum to 1, got 0.9"),
+        ({"Si": {27: 1.0}}, "isotopes of Si must be one of 28, 29, 30, got 27"),
+        ({"Sj": {28: 1.0}}, "isotopes must be of chemical elements such as Si, got 'Sj'"),
+        ({"Si": {28: -1.0}}, "abundances of Si must be from 0 to 1, got -1"),
+        ({"Si": 0.5}, "isotopes of Si must be"),
+        (["Si"], "isotopes must be"),
+    ],
+)
+def test_wrong_abundances_are_refused_in_a_sentence(isotopes, sentence):
+    with pytest.raises(ValueError, match="^" + sentence.replace("(", r"\(")) as error:
+        ae.spectrum(ae.Hits(mass_to_charge=[14.0]), isotopes=isotopes)
+    assert "\n" not in str(error.value)
+
+
+def test_the_command_prints_what_python_gives(tmp_path, capsys):
+    hits = made({("Ni", 2): 9, ("Al", 1): 1}, 20_000)
+    path = tmp_path / "a.epos"
+    n = len(hits)
+    zeros, ones = np.zeros(n), np.ones(n, int)
+    columns = {name: zeros for name in ("x", "y", "time_of_flight", "voltage", "pulse_voltage")}
+    columns |= {"pulses": ones, "multiplicity": ones, "pulse_id": np.arange(n), "positions": np.zeros((n, 3))}
+    ae.write(path, ae.Hits(mass_to_charge=hits.mass_to_charge, **columns))
+    assert main(["composition", str(path), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    expected = ae.spectrum(ae.read(path)).composition
+    assert content == {
+        "composition": {name: {"at_percent": expected[name], "error": expected.error[name]} for name in ("Ni", "Al")},
+        "unexplained": expected.unexplained,
+    }
+    assert main(["composition", str(path)]) == 0
+    assert capsys.readouterr().out.startswith("unexplained: ")
+    assert main(["composition", str(path), "--element", "Ni,Al", "--isotope", "Ni=58:0.7,60:0.3", "--json"]) == 0
+    capsys.readouterr()
+    for words in (["--isotope", "Ni"], ["--isotope", "Ni=58:x"], ["--element", "Nj"], ["--isotope", "Ni=58:0.5"]):
+        assert main(["composition", str(path), *words]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("apt-evap: error: ") and error.count("\n") == 1
+
+
+def test_a_file_without_peaks_is_an_error_of_the_command(tmp_path, capsys):
+    np.stack([np.zeros(400)] * 3 + [np.geomspace(1, 200, 400)], 1).astype(">f4").tofile(tmp_path / "a.pos")
+    assert main(["composition", str(tmp_path / "a.pos")]) == 2
+    assert "a composition needs peaks" in capsys.readouterr().err
