@@ -36,8 +36,8 @@ from .maps.indexing.index_map import index as index
 from .maps.registration.register import Registration as Registration
 from .maps.registration.register import register as register
 from .maps.similarity import similarity as similarity
-from .reconstruction.reconstruct import Reconstruction as Reconstruction
 from .reconstruction.reconstruct import reconstruct as reconstruct
+from .reconstruction.reconstructed import Reconstruction as Reconstruction
 from .simulation.flight.response import ResponseSettings as ResponseSettings
 from .simulation.read_file import read as read
 from .simulation.run import Run as Run

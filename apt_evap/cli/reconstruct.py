@@ -22,6 +22,8 @@ _CONSTANTS = (
     "shank_angle",
 )
 """Fields of `ReconstructionSettings` that are options."""
+_ASSUMED = ("compression", "field_factor", "efficiency")
+"""Those with a default, which is printed if it is used."""
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +37,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng\n"
         "  apt-evap reconstruct ni111.h5 --real-units\n"
+        "  apt-evap reconstruct R5083.epos --element Al --distance 90 --efficiency 0.57 --shape evolving \\\n"
+        "      --ranges R5083.rrng --solutes Mg,Zn\n"
         "  apt-evap reconstruct R5083.epos --atomic-volume 0.02 --distance 90 --radius shank --initial-radius 30 \\\n"
         "      --shank-angle 5"
     )
@@ -51,6 +55,21 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         metavar="P.png",
         help="side view, top view, depth profile and composition; --ranges gives the species of measured ions; "
         "default: the name of OUT with .png",
+    )
+    surface = parser.add_argument_group("surface")
+    surface.add_argument(
+        "--shape",
+        choices=("cap", "evolving"),
+        default="cap",
+        help="the surface stays a sphere, or follows the ions; default: cap",
+    )
+    surface.add_argument(
+        "--solutes",
+        metavar="A,B",
+        help="species whose composition changes the field, for an evolving shape",
+    )
+    surface.add_argument(
+        "--labels", metavar="COLUMN", help="a column of the ions with the number of their phase, in place of --solutes"
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
     add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
@@ -78,6 +97,8 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.cli._files import file_of, note
     from apt_evap.io.formats import read_ranges, write
     from apt_evap.plot.reconstructions import FEWEST
+    from apt_evap.reconstruction.assumptions import assumptions
+    from apt_evap.reconstruction.evolving import EvolvingReconstruction
     from apt_evap.reconstruction.origins import OriginTable
     from apt_evap.reconstruction.reconstruct import reconstruct
     from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_figure
@@ -89,30 +110,30 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
     hits, known = _ions(options)
     settings = _settings(options, known)
-    if not {"atomic_volume", "element"} & set(settings):
-        raise ValueError("--atomic-volume [nm^3] or --element is missing")
-    if "distance" not in settings:
-        raise ValueError("--distance is missing: the flight length [mm] is needed for ions that are not from a run")
-    if hits.voltage is None and settings["radius"] == "voltage":
-        raise ValueError(
-            f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
-        )
+    _check_complete(options, settings, hits)
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
     file = file_of(options)
-    if options.species is None:  # ranges are then only for the picture
+    if options.species is None:  # ranges are then for the picture and the solutes
         file = replace(file, ranges=None)
     origins = None if options.origins is None else OriginTable.load(options.origins)
-    reconstruction = reconstruct(file.select(hits, note), origins=origins, **settings)
+    selection = file.select(hits, note)
+    reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
     figure = None
     if options.picture is not None or len(reconstruction) >= FEWEST:
         figure = plot.reconstruction(reconstruction, ranges)[0].figure
     write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
+    assumed = assumptions(reconstruction, [name for name in _ASSUMED if name not in settings])
+    for one in assumed:
+        tell(options, str(one))
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     if figure is not None:
         save_figure(picture, figure)
         result["picture"] = str(picture)
     result["settings"] = for_json(reconstruction.settings)
+    result["assumed"] = [one._asdict() for one in assumed]
+    if isinstance(reconstruction, EvolvingReconstruction):
+        result["surface"] = _tell_surface(options, reconstruction)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -121,6 +142,69 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"no picture of fewer than {FEWEST} ions" if figure is None else f"wrote {picture}")
     tell_json(options, result)
     return 0
+
+
+def _check_complete(options, settings, hits):
+    """Raise one error that names all constants that are missing, each with a value to start from."""
+    from apt_evap.reconstruction.assumptions import STARTS
+
+    if hits.voltage is None and settings["radius"] == "voltage":
+        raise ValueError(
+            f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
+        )
+    missing = [] if "distance" in settings else ["distance"]
+    if not {"atomic_volume", "element"} & set(settings):
+        missing.append("element")
+    elif settings["radius"] == "voltage" and not {"evaporation_field", "element"} & set(settings):
+        missing.append("evaporation_field")
+    if settings["radius"] == "shank":
+        missing += [name for name in ("initial_radius", "shank_angle") if name not in settings]
+    if missing:
+        listed = "; ".join(
+            f"--{name.replace('_', '-')} (start with {start}: {source})"
+            for name, (start, source) in ((name, STARTS[name]) for name in missing)
+        )
+        raise ValueError(f"{options.file!r} needs constants that are not in it, got none of {listed}")
+
+
+def _surface(options, hits, ranges):
+    """Arguments of `reconstruct` for the surface."""
+    if options.shape == "cap" and (options.solutes or options.labels):
+        raise ValueError(f"--{'solutes' if options.solutes else 'labels'} needs --shape evolving, got --shape cap")
+    arguments = {"shape": options.shape, "ranges": ranges}
+    if options.solutes:
+        arguments["solutes"] = tuple(options.solutes.split(","))
+    if options.labels:
+        if options.labels not in hits.extra:
+            raise ValueError(
+                f"--labels must be a column of {options.file!r}, got {options.labels!r}; its own columns are "
+                f"{', '.join(sorted(hits.extra)) or 'none'}"
+            )
+        arguments["labels"] = hits.extra[options.labels]
+    return arguments
+
+
+def _tell_surface(options, reconstruction):
+    """Say what the surface was followed by and which fields were found; the same as numbers."""
+    import numpy as np
+
+    tell(options, reconstruction.verdict)
+    for phase in reconstruction.phases:
+        where = f", {phase.content:.1%} in {phase.matrix:.1%}" if phase.contrast == phase.contrast else ""
+        tell(options, f"evaporation field of {phase.name}{where}: {phase.ratio:.3f} ± {phase.error:.3f} of the matrix")
+    found = {"verdict": reconstruction.verdict, "phases": [vars(phase) for phase in reconstruction.phases]}
+    history = reconstruction.history
+    if history is not None:
+        low, high = np.quantile(history.recession, (0.05, 0.95))
+        tell(options, f"recession over that of a cap: {low:.2f} to {high:.2f} in 90 % of the depth")
+        found |= {
+            "depths": history.depths.tolist(),
+            "radii": history.radii.tolist(),
+            "recession": history.recession.tolist(),
+            "voltage": history.voltage.tolist(),
+            "model_voltage": history.model_voltage.tolist(),
+        }
+    return found
 
 
 def _ions(options):

@@ -11,7 +11,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import add_colorbar, new_figure, set_title
 from apt_evap.plot.limits import color_limits
 from apt_evap.plot.map_figures import binned
-from apt_evap.reconstruction.reconstruct import Reconstruction
+from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges
 
 _COLORS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "0.6")

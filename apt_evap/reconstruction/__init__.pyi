@@ -1,8 +1,10 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
+from .assumptions import assumptions as assumptions
 from .calibration import compression_from_poles as compression_from_poles
 from .calibration import distribution_map as distribution_map
 from .consistency import checks as checks
 from .constants import run_constants as run_constants
+from .evolving import EvolvingReconstruction as EvolvingReconstruction
 from .interface import interface_profile as interface_profile
 from .interface import segregation_profile as segregation_profile
 from .origins import origin_table as origin_table

@@ -8,7 +8,7 @@ import numpy as np
 
 from apt_evap._common.validation import check_array, check_kind, check_number, check_pairs
 from apt_evap.reconstruction.calibration import distribution_map
-from apt_evap.reconstruction.reconstruct import Reconstruction
+from apt_evap.reconstruction.reconstructed import Reconstruction
 
 _LEAST_AMPLITUDE = 0.05  # of planes that are resolved
 _CORE = 0.5  # of the field of view, in which the density is counted

@@ -14,7 +14,7 @@ from apt_evap._common.codec import for_json
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_kind, short_text
 from apt_evap.reconstruction.errors import groups_of, per_ion, true_sites
-from apt_evap.reconstruction.reconstruct import Reconstruction
+from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.simulation.run import Run
 
 _FEWEST = 10  # ions of a precipitate: three times the dimensions of its moments

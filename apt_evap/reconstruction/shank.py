@@ -10,7 +10,8 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.reconstruction.reconstruct import Reconstruction, reconstruct
+from apt_evap.reconstruction.reconstruct import reconstruct
+from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.reconstruction.reconstruction_settings import (
     ReconstructionSettings,
     resolved_settings,

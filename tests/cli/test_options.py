@@ -12,7 +12,7 @@ from apt_evap.cli.parser import make_parser
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS, EnergyGrid
-from apt_evap.reconstruction.reconstruct import FRAMES
+from apt_evap.reconstruction.reconstructed import FRAMES
 from apt_evap.reconstruction.reconstruction_settings import PROJECTIONS, PROTOCOLS, ReconstructionSettings
 
 

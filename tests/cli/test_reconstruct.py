@@ -79,12 +79,13 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ("--element Ni", "--distance is missing"),
-        ("--distance 90", "--atomic-volume [nm^3] or --element is missing"),
+        ("--element Ni", "needs constants that are not in it, got none of --distance (start with 90: mm"),
+        ("", "--distance (start with 90: mm, of straight flights"),
+        ("--distance 90", "--element (start with the main element: or the atomic volume"),
         ("--distance 90 --element Ni --radius apex", "--radius must be voltage, shank or a number [nm], got 'apex'"),
         ("--distance 90 --element Ni --radius -1", "--radius must be a finite number [nm] > 0, got -1.0"),
         ("--distance 90 --element Nix", "--element"),
-        ("--distance 90 --atomic-volume 0.01", 'radius="voltage" needs evaporation_field'),
+        ("--distance 90 --atomic-volume 0.01", "--evaporation-field (start with that of the main element"),
         ("--distance 90 --element Ni --real-units", "--real-units needs a run (.h5)"),
         ("--distance 90 --element Ni -o ni.png", "format of 'ni.png' must be one of"),
         ("--distance 90 --element Ni --protocol geiser", "invalid choice: 'geiser'"),

@@ -8,7 +8,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.reconstruction.cap_geometry import CapGeometry
-from apt_evap.reconstruction.reconstruct import Reconstruction
+from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings
 
 RADIUS, DENSITY = 3.0, 60.0  # nm, ions / nm^3

@@ -1,0 +1,582 @@
+"""Reconstruction by a surface that follows its ions: recession from the voltage and the phases, fields by fixed point.
+
+The steps of `follow_surface`: the cap, a pass with the recession from the ring, the phases at the positions of this
+pass, then passes with the recession from voltage and phases, each with the evaporation fields that the pass before has
+found.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Booleans, Floats
+from apt_evap._common.validation import check_array, check_number, check_sequence, did_you_mean
+from apt_evap.detection.hits import Hits
+from apt_evap.reconstruction.beyond_view import Continuation, Feature, continued
+from apt_evap.reconstruction.cap_geometry import voltages_of
+from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence, SurfacePass
+from apt_evap.reconstruction.local_composition import (
+    SoluteContrast,
+    contents,
+    local_composition,
+    noise_free_slopes,
+    solute_contrast,
+)
+from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruction
+from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings, slope_of_shank
+from apt_evap.spectra.mass_ranges import Ranges
+
+FEWEST_IONS = 2000
+"""Fewest ions that a surface is integrated from: 20 in each step of a specimen that recedes by R / 1.3."""
+WIDEST_VIEW = 60.0
+"""Largest half angle of the field of view [degrees]: beyond, the response of a sphere does not describe a specimen."""
+
+EMISSION_GATE = 0.33
+"""Largest contrast of the density of the matrix on the detector: 0.19 to 0.24 at rest or with rolling of aluminium,
+0.45 if all ions roll, and then the surface is no better than the cap."""
+
+_PASSES = 7  # with voltage and phases after the first: fields change by less than 0.005 in the last
+_ION_LIMIT = 150_000  # in these passes; of more ions, every n-th
+_SMOOTHING = 1 / 87  # of the radius: depth over which the voltage is averaged, 0.15 nm of R = 13 nm
+_SPIN_UP = 0.05  # of the ions, from which nothing is measured: the first shape is not known
+_CLEAN = 0.02  # of the ions of a block: largest share of phases in a stretch of matrix
+_CLEAN_BLOCKS = 100
+_FIELD_LIMITS = 0.5, 2.0  # of a phase relative to the matrix
+_FIELD_BIAS = 0.15  # of the difference to the matrix: by how much fields are found closer to 1, or farther
+_ION_LIMITS = 0.4, 2.5
+_CORE = 25  # neighbours for the core of a phase
+_CORE_SHARES = 0.92, 0.8, 0.6, 0.0  # of them: the first that leaves 100 ions
+_DENSITY_WIDTH = math.radians(3.0)  # of the Gaussian of the density on the detector
+_DENSITY_BINS = 61
+_CONSTANT = 1e-6  # relative spread of a voltage that does not change
+
+
+@dataclass(frozen=True)
+class PhaseField:
+    """Evaporation field of a phase, found by the reconstruction.
+
+    Parameters
+    ----------
+    name : str
+        Label of the phase, or the solute that it is enriched in.
+    ratio, error : float
+        Evaporation field relative to that of the matrix, and its standard error.
+    ions : int
+        Ions that belong to the phase.
+    matrix, content : float
+        Fraction of the solute in the matrix and in the phase; 0 and 1 for labels.
+    contrast : float
+        Contrast of the solute over its noise; NaN for labels.
+    """
+
+    name: str
+    ratio: float
+    error: float
+    ions: int
+    matrix: float
+    content: float
+    contrast: float
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceHistory:
+    """Shape and field of the surface through time, and what was measured; k steps.
+
+    Parameters
+    ----------
+    surface : EvolvingSurface
+        Grid and transform.
+    run : SurfacePass
+        The last pass.
+    voltage : ndarray
+        Mean voltage of each step relative to that of the matrix on a sphere, shape (k,); NaN without voltages.
+    """
+
+    surface: EvolvingSurface = field(repr=False)
+    run: SurfacePass = field(repr=False)
+    voltage: Floats = field(repr=False)
+
+    @property
+    def depths(self) -> Floats:
+        """Depth of the apex of the sphere at the beginning of each step [nm], shape (k,)."""
+        return self.run.steps.depths
+
+    @property
+    def radii(self) -> Floats:
+        """Radius of the sphere at the beginning of each step [nm], shape (k,)."""
+        ions = self.surface.ions
+        return ions.radius + ions.growth * self.depths
+
+    @property
+    def recession(self) -> Floats:
+        """Recession of the sphere over that of a cap that keeps its shape, shape (k,)."""
+        return self.run.steps.recession
+
+    @property
+    def model_voltage(self) -> Floats:
+        """Voltage at which the surface of each step evaporates, relative to the matrix on a sphere, shape (k,)."""
+        return self.voltage / self.run.steps.mean_field
+
+    @property
+    def shapes(self) -> Any:
+        """Coefficients of the height above the sphere [nm] of each step, shape (k, m, l), see `SphericalTransform`."""
+        return self.run.steps.shapes
+
+    def step_at(self, depth: float) -> int:
+        """Number of the step at a depth of the apex [nm]."""
+        wanted = check_number(depth, "depth", unit="nm")
+        return int(np.clip(np.searchsorted(self.depths, wanted, side="right") - 1, 0, len(self.depths) - 1))
+
+    def map_at(self, depth: float, bins: int = 64) -> tuple[Floats, Floats, Floats]:
+        """Height and field of the surface in the field of view, at a depth of the apex.
+
+        Parameters
+        ----------
+        depth : float
+            Depth of the apex of the sphere [nm].
+        bins : int
+            Number of cells along the diameter.
+
+        Returns
+        -------
+        edges : ndarray, shape (bins + 1,)
+            Edges of the cells in x / R and y / R.
+        height : ndarray, shape (bins, bins)
+            Height above the sphere [nm], indexed [y, x]; NaN outside the field of view.
+        field : ndarray, shape (bins, bins)
+            Field relative to the mean of the sphere.
+        """
+        surface, step = self.surface, self.step_at(depth)
+        coefficients = self.shapes[step]
+        degrees = surface.transform.degrees
+        grids = surface.transform.synthesis(np.stack([coefficients, (degrees - 1) * coefficients / self.radii[step]]))
+        rim = math.sin(surface.ions.rim)
+        edges = np.linspace(-rim, rim, bins + 1)
+        x, y = np.meshgrid((edges[1:] + edges[:-1]) / 2, (edges[1:] + edges[:-1]) / 2)
+        inside = x**2 + y**2 <= rim**2
+        directions = np.stack([x, y, np.sqrt(np.where(inside, 1 - x**2 - y**2, 1.0))], axis=-1).reshape(-1, 3)
+        height, excess = surface.at_directions(grids, directions).T.reshape(2, bins, bins)
+        return edges, np.where(inside, height, np.nan), np.where(inside, 1 + excess, np.nan)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EvolvingReconstruction(Reconstruction):
+    """Ions reconstructed by a surface that follows them; made by ``reconstruct(..., shape="evolving")``.
+
+    Parameters
+    ----------
+    history : SurfaceHistory or None
+        Shape and field of the surface through time; None if the cap was used.
+    phases : tuple of PhaseField
+        Evaporation fields that were found.
+    continuations : tuple of Continuation
+        How each phase was continued beyond the field of view.
+    verdict : str
+        What the surface was followed by, or why the cap was used, with the number that decided it.
+    apex_depths : ndarray
+        Depth of the apex of the sphere at each ion [nm], shape (n,).
+    ion_fields : ndarray
+        Evaporation field of each ion by its phase or surroundings relative to that of the matrix, shape (n,).
+    """
+
+    history: SurfaceHistory | None = None
+    phases: tuple[PhaseField, ...] = ()
+    continuations: tuple[Continuation, ...] = ()
+    verdict: str = ""
+    apex_depths: Floats | None = None
+    ion_fields: Floats | None = None
+
+    _has_free_projection: ClassVar[bool] = False
+
+    @property
+    def depths(self) -> Floats:
+        """Depth of the apex of the sphere at the evaporation of each ion [nm], shape (n,)."""
+        return super().depths if self.apex_depths is None else self.apex_depths
+
+    def __repr__(self) -> str:
+        fields = "".join(f"; {phase.name} {phase.ratio:.3f} ± {phase.error:.3f}" for phase in self.phases)
+        return f"{super().__repr__()[:-1]}; {self.verdict}{fields}>"
+
+
+class _Measured(NamedTuple):
+    """What the surface follows: ions, their voltage, and labels or solutes."""
+
+    ions: IonSequence
+    voltages: Floats | None  # relative
+    names: tuple[str, ...]
+    own: tuple[Booleans, ...]  # ions of each label or solute
+    has_labels: bool
+
+    def part(self, first: int, every: int) -> _Measured:
+        """Every n-th ion."""
+        rows = slice(first, None, every)
+        return self._replace(
+            ions=self.ions.part(first, every),
+            voltages=None if self.voltages is None else self.voltages[rows],
+            own=tuple(own[rows] for own in self.own),
+        )
+
+
+class _Fixed(NamedTuple):
+    """Result of the passes over part of the ions."""
+
+    way: str  # recession of the last pass
+    level: float  # of the voltage
+    trend: Floats  # of the voltage over the nominal depth: value at 0, slope
+    features: list[Feature]
+    contrasts: list[SoluteContrast]
+    fields: Floats  # of each ion
+    positions: Floats  # of the last pass but one, from which the phases are continued
+    ways: list[Continuation]
+    ratios: Floats
+    errors: Floats
+
+
+def follow_surface(
+    hits: Hits,
+    settings: ReconstructionSettings,
+    ranges: Ranges | None = None,
+    solutes: Sequence[str] = (),
+    labels: ArrayLike | None = None,
+) -> EvolvingReconstruction:
+    """Reconstruct ions by a surface that follows them, see `reconstruct`.
+
+    Parameters
+    ----------
+    hits : Hits
+        Ions in the sequence of evaporation.
+    settings : ReconstructionSettings
+        Resolved settings.
+    ranges, solutes, labels
+        As for `reconstruct`.
+
+    Returns
+    -------
+    EvolvingReconstruction
+
+    Raises
+    ------
+    ValueError
+        If settings, solutes and labels do not fit together, or the ions are not in sequence.
+    """
+    if settings.protocol != "cap":
+        raise ValueError(f'protocol must be "cap" with shape="evolving", got {settings.protocol!r}')
+    cap, rows = cap_reconstruction(hits, settings)
+    _check_sequence(cap.hits)
+    names, own = _phases_of(cap.hits, rows, len(hits), ranges, solutes, labels)
+    rim = float(np.mean(cap.geometry.rim_angles(cap.hits, cap.radii)))
+    if len(cap) < FEWEST_IONS:
+        return _as_cap(cap, f"{len(cap):,} ions, fewer than {FEWEST_IONS:,}")
+    if math.degrees(rim) > WIDEST_VIEW:
+        return _as_cap(cap, f"a half angle of {math.degrees(rim):.0f} degrees on the cap, above {WIDEST_VIEW:.0f}")
+    places, angles = cap.geometry.places(cap.hits, cap.radii)
+    radius, growth = _growth_of(cap)
+    ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius, growth)
+    voltages, why = _relative_voltages(cap.hits, ions)
+    measured = _Measured(ions, voltages, names, own, labels is not None)
+    every = -(-len(cap) // _ION_LIMIT)
+    thinned = measured.part(0, every) if every > 1 else measured
+    contrast = _density_contrast(thinned)
+    if contrast > EMISSION_GATE:
+        return _as_cap(
+            cap, f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
+        )
+    fixed = _fixed_point(thinned)
+    if isinstance(fixed, str):
+        return _as_cap(cap, fixed + (f" ({why})" if why else ""))
+    return _placed(cap, measured, fixed, every, why)
+
+
+def _check_sequence(hits):
+    """Raise an error if a column shows that the ions are not in the sequence of evaporation."""
+    for name in ("ion", "pulse_id"):
+        numbers = getattr(hits, name)
+        if numbers is not None and (falls := np.flatnonzero(np.diff(numbers) < 0)).size:
+            row = int(falls[0]) + 1
+            raise ValueError(
+                f"hits must be in the sequence of evaporation, got {name} {numbers[row]} after {numbers[row - 1]} at "
+                f"ion {row}"
+            )
+
+
+def _phases_of(hits, rows, n, ranges, solutes, labels):
+    """Names of the labels but the matrix, or of the solutes, and which ions are of each."""
+    if labels is not None and len(solutes):
+        raise ValueError("labels and solutes exclude each other, got both")
+    if labels is not None:
+        chosen = check_array(labels, "labels", (n,), dtype=np.int64)[rows]
+        kinds, counts = np.unique(chosen, return_counts=True)
+        if len(kinds) < 2:
+            raise ValueError(f"labels must mark at least two phases, got {kinds[0]} for all {len(chosen):,} ions")
+        others = [kind for kind in kinds if kind != kinds[counts.argmax()]]
+        return tuple(f"label {kind}" for kind in others), tuple(chosen == kind for kind in others)
+    names = tuple(check_sequence(solutes, "solutes", "names of species"))
+    if not names:
+        return (), ()
+    if ranges is not None:
+        species, numbers = list(ranges.species_names), ranges.species(hits)
+        own = {name: numbers == index for index, name in enumerate(species)}
+    elif "element" in hits.extra:
+        elements = hits.extra["element"].astype(str)
+        own = {str(name): elements == name for name in np.unique(elements)}
+    else:
+        raise ValueError(f"solutes={names} need ranges, or the elements of simulated ions, got neither")
+    for name in names:
+        if name not in own:
+            raise ValueError(f"solutes must be species of the ranges, got {name!r}{did_you_mean(name, list(own))}")
+        if not own[name].any():
+            raise ValueError(f"solutes must be among the ions, got {name!r} of which there is none")
+    return names, tuple(own[name] for name in names)
+
+
+def _density_contrast(measured):
+    """Standard deviation of the density of the matrix over the field of view, without the noise of the counts."""
+    ions, matrix = measured.ions, np.ones(len(measured.ions.directions), bool)
+    if measured.has_labels:
+        matrix = ~np.any(measured.own, axis=0)
+    rim = math.sin(ions.rim)  # an even flux is even in x / R and y / R
+    edges = np.linspace(-1.02 * rim, 1.02 * rim, _DENSITY_BINS + 1)
+    counts = np.histogram2d(*ions.directions[matrix, :2].T, bins=(edges, edges))[0]
+    centres = (edges[1:] + edges[:-1]) / 2
+    inside = centres[:, None] ** 2 + centres**2 < rim**2
+    width = _DENSITY_WIDTH / (edges[1] - edges[0])
+    counted, seen = (scipy.ndimage.gaussian_filter(part.astype(float), width) for part in (counts, inside))
+    density = (counted / np.maximum(seen, 0.05))[inside]
+    noise = np.count_nonzero(inside) / max(counts.sum(), 1) / (4 * math.pi * width**2)
+    return math.sqrt(max(0.0, density.var() / max(density.mean(), 1e-12) ** 2 - noise))
+
+
+def _as_cap(cap, reason):
+    """The cap, and why it was used."""
+    columns = {part.name: getattr(cap, part.name) for part in fields(Reconstruction)}
+    return EvolvingReconstruction(**columns, verdict=f"cap: {reason}")
+
+
+def _growth_of(cap):
+    """Radius of the cap at the first ion [nm], and its increase per depth."""
+    settings = cap.settings
+    if settings.mode == "shank":
+        return settings.initial_radius, slope_of_shank(settings.shank_angle)
+    radii, depths = cap.radii, cap.depths
+    if np.ptp(radii) == 0:
+        return float(radii[0]), 0.0
+    # a straight line through the medians of 40 sections: a phase of another field is not a change of the radius
+    sections = [part for part in np.array_split(np.arange(len(radii)), 40) if len(part)]
+    at = np.array([np.median(depths[part]) for part in sections])
+    slope, start, _, _ = scipy.stats.theilslopes([np.median(radii[part]) for part in sections], at)
+    growth = float(np.clip(slope, 0.0, 1.0))
+    if growth == 0:
+        return float(np.median(radii)), 0.0
+    return float(max(start + slope * depths[0], 1e-3)), growth
+
+
+def _relative_voltages(hits, ions):
+    """Voltage of each ion over its mean, averaged over a depth, or None and why."""
+    if hits.voltage is None:
+        return None, "no voltage"
+    total = voltages_of(hits)
+    if np.ptp(total) <= _CONSTANT * total.mean():
+        return None, f"a constant voltage of {total[0]:g} V"
+    width = _SMOOTHING * ions.radius / ions.depths[-1] * len(total)
+    smooth = scipy.ndimage.gaussian_filter1d(total, max(width, 1.0), mode="nearest")
+    return smooth / smooth.mean(), ""
+
+
+def _fixed_point(measured):
+    """Passes until the evaporation fields are found, or why the cap must be used."""
+    ions, own = measured.ions, measured.own
+    n = len(ions.directions)
+    surface = EvolvingSurface(ions)
+    ring = surface.integrate()
+    halves = np.random.default_rng(0).integers(0, 2, n).astype(bool)
+    contrasts: list[SoluteContrast] = []
+    names = measured.names
+    if not measured.has_labels:
+        contrasts = [solute_contrast(ring.positions, one, halves, ions.volume) for one in own]
+    seen = [k for k in range(len(own)) if measured.has_labels or contrasts[k].is_seen]
+    ratios = np.ones(len(own))
+    nothing = _Fixed(
+        way="ring", level=1.0, trend=np.array([1.0, 0.0]), features=[], contrasts=contrasts, fields=np.ones(n),
+        positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
+    )  # fmt: skip
+    if not seen:
+        return nothing
+    names = tuple(names[k] for k in seen)
+    compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
+    _, ways = continued(features, ring.positions, ions.in_ring)
+    reaches = [way for way in ways if way.way != "none"]
+    if measured.voltages is None:
+        if reaches:
+            worst = max(way.share for way in reaches)
+            return f"a phase reaches the rim of the field of view, {worst:.2f} of the ring, and the voltage is needed"
+        return nothing._replace(features=features, ways=ways)
+    # On a shank the voltage without its slow trend, by the matrix in a pass without voltage: it is not proportional to
+    # the radius. With a constant radius a trend would be one of the phases: depth errors 0.138 in place of 0.122 nm.
+    depths, trend = ions.depths[1:], nothing.trend
+    if ions.growth > 0:
+        trend = _trend(measured.voltages * ring.fields, _matrix(features), depths)
+    voltages = measured.voltages / (trend[0] + trend[1] * depths)
+    level = _level(voltages, ring.fields, features, n)
+    found = surface.integrate(voltages / level, _ion_fields(features), recession="mean")
+    errors = np.zeros(len(own))
+    for _ in range(_PASSES):
+        compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
+        outside, ways = continued(features, found.positions, ions.in_ring)
+        before, thresholds = found.positions, _ion_fields(features)
+        found = surface.integrate(voltages / level, thresholds, outside, "surface")
+        values = found.fields * voltages / level
+        compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
+        level = _level(voltages, found.fields, features, n)
+        new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
+        ratios = ratios.copy()
+        ratios[seen] = np.clip(new, *_FIELD_LIMITS)
+    return _Fixed("surface", level, trend, features, contrasts, thresholds, before, ways, ratios, errors)
+
+
+def _features(measured, seen, contrasts, halves, positions, ratios):
+    """Phases at the positions of a pass, and the compositions they follow from."""
+    compositions, features = [], []
+    for k in seen:
+        own = measured.own[k]
+        if measured.has_labels:
+            features.append(Feature(own.astype(np.float64), own, 0.0, 1.0, float(ratios[k])))
+            continue
+        neighbours = contrasts[k].neighbours
+        found = local_composition(positions, own, halves, neighbours, measured.ions.volume)
+        matrix, content = contents(found, neighbours)
+        compositions.append(found)
+        membership = (found.all - matrix) / (content - matrix)
+        features.append(Feature(membership, own, matrix, content, float(ratios[k])))
+    return compositions, features
+
+
+def _ion_fields(features):
+    """Evaporation field of each ion relative to that of the matrix, shape (n,)."""
+    return np.clip(1 + sum((one.ratio - 1) * one.membership for one in features), *_ION_LIMITS)
+
+
+def _matrix(features):
+    """How far each ion belongs to the matrix, without those of the first shape, shape (n,)."""
+    weights = np.clip(1 - sum(np.clip(one.membership, 0, 1) for one in features), 0, 1)
+    weights[: int(_SPIN_UP * len(weights))] = 0
+    return weights
+
+
+def _trend(values, weights, depths):
+    """Value at depth 0 and slope of a straight line through weighted values."""
+    if weights.sum() < FEWEST_IONS / 10:
+        return np.array([1.0, 0.0])
+    slope, start = np.polyfit(depths, values, 1, w=np.sqrt(weights))
+    return np.array([start, slope])
+
+
+def _level(voltages, at_ions, features, n):
+    """Voltage of the matrix on a sphere: of the longest stretch of matrix, else such that V F of the matrix is 1."""
+    blocks = np.minimum(np.arange(n) * _CLEAN_BLOCKS // n, _CLEAN_BLOCKS - 1)
+    counts = np.bincount(blocks, minlength=_CLEAN_BLOCKS)
+    clean = np.ones(_CLEAN_BLOCKS, bool)
+    for one in features:
+        noise = math.sqrt(one.background * (1 - one.background) / (n / _CLEAN_BLOCKS)) / (one.content - one.background)
+        share = np.bincount(blocks, np.clip(one.membership, 0, 1) if one.background == 0 else one.membership) / counts
+        clean &= share < _CLEAN + 1.5 * noise
+    clean[: int(0.04 * _CLEAN_BLOCKS)] = False
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], clean, [False]]).astype(int)))
+    starts, stops = edges[::2], edges[1::2]
+    if len(starts):
+        longest = int((stops - starts).argmax())
+        chosen = (blocks >= starts[longest]) & (blocks < stops[longest])
+        if chosen.sum() > 0.05 * n:
+            return float(voltages[chosen].mean())
+    weights = _matrix(features)
+    return float((voltages * at_ions * weights).sum() / max(weights.sum(), 1e-9))
+
+
+def _found_fields(measured, features, compositions, values, positions):
+    """Evaporation fields of the phases relative to the matrix by V F of their ions, and standard errors."""
+    n = len(values)
+    later = np.arange(n) >= int(_SPIN_UP * n)
+    blocks = np.arange(n) * 20 // n  # of the sequence, left out one after the other for the errors
+
+    def ratios(chosen):
+        if measured.has_labels:
+            reference = np.average(values[chosen], weights=matrix[chosen])
+            inner = [chosen & core for core in cores]
+            return np.array([values[core].mean() / reference if core.any() else np.nan for core in inner])
+        parts = [type(one)(one.all[chosen], one.first[chosen], one.second[chosen]) for one in compositions]
+        slopes = noise_free_slopes(values[chosen], parts)
+        enriched = [part.all.mean() - one.background for part, one in zip(parts, features, strict=True)]
+        reference = values[chosen].mean() - slopes @ enriched
+        return 1 + slopes / reference * [one.content - one.background for one in features]
+
+    matrix = _matrix(features)
+    cores = []
+    if measured.has_labels:
+        for one in features:
+            near = local_composition(positions, one.own, later, _CORE, measured.ions.volume).all
+            for share in _CORE_SHARES:
+                core = one.own & (near >= share)
+                if core.sum() > 100:
+                    break
+            cores.append(core)
+    best = ratios(later)
+    left_out = np.array([ratios(later & (blocks != block)) for block in range(20)])
+    with np.errstate(invalid="ignore"):
+        scatter = np.sqrt(np.nansum((left_out - np.nanmean(left_out, axis=0)) ** 2, axis=0) * 19 / 20)
+    return best, np.hypot(scatter, _FIELD_BIAS * np.abs(best - 1))
+
+
+def _placed(cap, measured, fixed, every, why):
+    """All ions on the surface that the fields lead to."""
+    ions = measured.ions
+    surface = EvolvingSurface(ions)
+    thresholds = np.repeat(fixed.fields, every)[: len(cap)]
+    voltages = outside = None
+    if fixed.way == "surface":
+        depths = ions.depths[1:]
+        voltages = measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level
+        part = ions.part(0, every) if every > 1 else ions
+        outside = continued(fixed.features, fixed.positions, part.in_ring)[0]
+    found = surface.integrate(voltages, thresholds, outside, fixed.way)
+    edges = found.steps.first_ions
+    means = np.full(len(edges) - 1, np.nan)
+    if voltages is not None:
+        total = np.concatenate([[0.0], np.cumsum(voltages)])
+        means = np.diff(total[edges]) / np.maximum(np.diff(edges), 1)
+    positions = found.positions.copy()
+    positions[:, 2] = ions.radius - positions[:, 2]  # depth below the apex of the first sphere
+    numbers = {name: k for k, name in enumerate(measured.names)}
+    known = fixed.contrasts or [SoluteContrast(0.0, 1.0, math.nan, 0)] * len(numbers)
+    phases = tuple(
+        PhaseField(
+            name, float(fixed.ratios[k]), float(fixed.errors[k]), int(measured.own[k].sum()), known[k].matrix,
+            known[k].phase, known[k].contrast,
+        )
+        for name, k in numbers.items()
+    )  # fmt: skip
+    return EvolvingReconstruction(
+        positions, cap.hits, ions.radius + ions.growth * found.apex_depths, cap.settings, cap.geometry,
+        history=SurfaceHistory(surface, found, means), phases=phases, continuations=tuple(fixed.ways),
+        verdict=_verdict(fixed, measured, why), apex_depths=found.apex_depths, ion_fields=thresholds,
+    )  # fmt: skip
+
+
+def _verdict(fixed, measured, why):
+    """One sentence on what the surface was followed by."""
+    share = max((way.share for way in fixed.ways), default=0.0)
+    if fixed.way == "ring":
+        if measured.names and not fixed.features:
+            best = max(one.contrast for one in fixed.contrasts)
+            return f"followed by the flux at the rim: no solute has a contrast over its noise, at most {best:.1f}"
+        because = f", {why}" if why and measured.names else ""
+        return f"followed by the flux at the rim: at most {share:.2f} of it is of a phase{because}"
+    how = {way.way for way in fixed.ways} - {"none"}
+    ways = {"plane": "continued as a plane", "ring": "continued from the ions at its azimuth"}
+    beyond = f", {' and '.join(ways[way] for way in sorted(how))}" if how else ""
+    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{beyond}"

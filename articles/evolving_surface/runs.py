@@ -1,0 +1,133 @@
+"""
+Runs with a known truth
+=======================
+
+Specimens of aluminium with phases of other evaporation fields, evaporated at a constant potential, and what a detector
+sees of them. Each run is one file ``NAME_SEED.npz`` with the sites, phases and species of all atoms in sequence, their
+landing places, and the voltage at which each site would have left. A run of R = 12 nm takes two to three minutes on a
+processor core. ``python runs.py NAME:SEED ... -o FOLDER``; without names, the list of all.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+
+import apt_evap as ae
+
+ALUMINIUM = ae.material("Al")
+VOLUME = ALUMINIUM.a**3 / 4  # nm^3
+R = 12.0  # nm
+COVER, BELOW, SIZE = 0.8, 1.2, 3.2  # nm: matrix above and below a sphere, its radius
+ROLLING = 3.25  # energies at 1,000 V over those at the voltage of a measurement
+
+
+def sphere(name, ratio, tilt=0.0, azimuth=35.0, radius=SIZE, cover=COVER, apex=R):
+    """A sphere below the surface, at an angle from the axis [degrees], with a field relative to the matrix."""
+    return phase(name, ball(tilt, azimuth, radius, cover, apex), ratio)
+
+
+def ball(tilt, azimuth, radius, cover, apex=R):
+    """Region of a sphere."""
+    theta, phi = np.radians((tilt, azimuth))
+    way = np.array((np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)))
+    return ae.specimen.Sphere(tuple((apex - cover - radius) * way), radius)
+
+
+def layer(ratio, tilt, width=2.4):
+    """A layer through the place of the sphere, its normal at an angle from the axis [degrees]."""
+    theta = np.radians(tilt)
+    normal = np.array((0.8 * np.sin(theta), 0.6 * np.sin(theta), np.cos(theta)))
+    middle = normal[2] * (R - COVER - SIZE)
+    return phase("layer", ae.specimen.Layer(middle - width / 2, middle + width / 2, tuple(normal)), ratio)
+
+
+def phase(name, region, ratio, **more):
+    """A phase of aluminium with an evaporation field relative to that of the matrix."""
+    return ae.specimen.Phase(name, ALUMINIUM, region, evaporation_field=ratio * ALUMINIUM.evaporation_field, **more)
+
+
+def alloy(region, share):
+    """Matrix of 2 % and region of another share of copper, whose evaporation field is 0.6 times that of aluminium."""
+    copper = ae.material("Cu", a=ALUMINIUM.a)
+    fields = {"Al": ALUMINIUM.evaporation_field, "Cu": 0.6 * ALUMINIUM.evaporation_field}
+    matrix = ae.specimen.Phase("matrix", ALUMINIUM, solutes={copper: 0.02}, evaporation_field=fields)
+    return [matrix, ae.specimen.Phase("sphere", ALUMINIUM, region, solutes={copper: share}, evaporation_field=fields)]
+
+
+def case(name):
+    """Phases beside the matrix, angle of the shank [degrees] and emissions of a case."""
+    shank, emissions = 1.5, {"rest": ae.Unperturbed()}
+    if name.endswith("_shank"):
+        name, shank = name.removesuffix("_shank"), 6.0
+    elif name.endswith("_rolled"):
+        name = name.removesuffix("_rolled")
+        emissions["metal"] = ae.RollUp.of_metal("Al", energy_scale=ROLLING)
+        emissions["all"] = ae.RollUp(ae.TruncatedNormal(0.3 * ROLLING, 0.3 * ROLLING))
+    phases = {
+        "pure": lambda: [],
+        "sphere_low": lambda: [sphere("sphere", 0.8)],
+        "sphere_low_off": lambda: [sphere("sphere", 0.8, 20)],
+        "sphere_high": lambda: [sphere("sphere", 1.2)],
+        "sphere_edge": lambda: [sphere("sphere", 0.85, 31, radius=2.4)],
+        "layer_high": lambda: [layer(1.15, 0)],
+        "layer_low": lambda: [layer(0.85, 0)],
+        "layer40_high": lambda: [layer(1.15, 40)],
+        "layer40_low": lambda: [layer(0.85, 40)],
+        "two_spheres": lambda: [
+            sphere("low", 0.8, 14, 0, 1.8, 0.6),
+            sphere("high", 1.2, 16, 200, 1.8, 1.8),
+        ],
+        "core_shell": lambda: [
+            phase("shell", ball(0, 0, 3.0, 0.8), 1.15),
+            phase("core", ball(0, 0, 1.7, 2.1), 0.85),
+        ],
+    }
+    if name == "alloy_sphere":
+        return alloy(ball(0, 0, SIZE, COVER), 0.4), shank, emissions
+    return [ae.specimen.Phase("matrix", ALUMINIUM), *phases[name]()], shank, emissions
+
+
+CASES = (
+    "pure:1 sphere_low_rolled:1 layer_high_rolled:1 layer40_high:1 sphere_low_off:1 layer_low:1 sphere_high:1 "
+    "two_spheres:1 layer40_low:1 layer_high_shank:1 sphere_edge:1 core_shell:1 alloy_sphere:1 sphere_low:2 layer_high:2"
+).split()  # fmt: skip
+
+
+def evaporate(name, seed, folder):
+    """Evaporate a case and keep what a reconstruction and its judgement need."""
+    phases, shank, emissions = case(name)
+    offset = 100 * seed + sum(map(ord, name)) % 97
+    tip = ae.Tip(
+        phases=phases, apex_radius=R, axis=(0, 1, 2), shank_angle=shank, shank_length=2 * R, depth=11.0,
+        offset_seed=offset, seed=offset,
+    )  # fmt: skip
+    ions = round((COVER + 2 * SIZE + BELOW) * np.pi * R**2 / VOLUME, -3)
+    simulation = ae.Simulation(tip, seed=offset, rule=ae.ConstantPotential(), n_threads=1)
+    run = simulation.run(int(ions), list(emissions.values()), responses=False, progress=False)
+    kept = {"sites": run.emissions.positions, "phase": run.phase, "species": run.species}
+    kept["voltage"] = run.voltage * run.evaporation_fields / run.fields
+    for label, emission in emissions.items():
+        hits = run.hits(emission)
+        kept[label] = np.stack([hits.x, hits.y], axis=1).astype(np.float32)
+    np.savez(folder / f"{name}_{seed}.npz", **kept)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", metavar="NAME:SEED", help=f"default: {' '.join(CASES)}")
+    parser.add_argument("-o", "--output", type=Path, default=Path("runs"), help="folder; default: runs")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    for text in options.cases or CASES:
+        name, seed = text.split(":")
+        if (options.output / f"{name}_{seed}.npz").exists():
+            continue
+        start = time.process_time()
+        evaporate(name, int(seed), options.output)
+        print(f"{text}: {time.process_time() - start:.0f} s of processor time", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Reconstruction by a surface that follows its ions: its gates, its sentences, and results without any phase."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fluxes import even_flux
+
+import apt_evap as ae
+
+KNOWN = {"atomic_volume": 0.0166, "efficiency": 0.5, "distance": 100.0, "projection": "compressed", "compression": 1.0}
+HALF = 0.54  # rad
+
+
+def ions_of(n=4000, half=HALF, **columns):
+    """Ions of an even flux on a plane detector, with a layer of another phase in the middle of the sequence."""
+    directions = even_flux(n, half)
+    hits = ae.Hits(x=100 * directions[:, 0] / directions[:, 2], y=100 * directions[:, 1] / directions[:, 2], **columns)
+    return hits, (np.arange(n) * 5 // n == 2).astype(int)
+
+
+def varying(n=4000):
+    return 3000.0 + 10 * np.sin(np.arange(n) / 300)  # V
+
+
+def evolving(hits, **changes):
+    return ae.reconstruct(hits, shape="evolving", **({"radius": 13.0} | KNOWN | changes))
+
+
+def test_without_phases_it_follows_the_ring_and_stays_close_to_the_cap():
+    hits, _ = ions_of()
+    found, cap = evolving(hits), ae.reconstruct(hits, radius=13.0, **KNOWN)
+    assert found.verdict == "followed by the flux at the rim: at most 0.00 of it is of a phase"
+    # the flux is even: the noise of 4,000 ions
+    assert np.abs(found.positions - cap.positions).mean() < 0.05
+    assert (np.diff(found.depths) > 0).all()
+    assert found.history.recession == pytest.approx(1.0, abs=0.1)
+    edges, height, field = found.history.map_at(0.5, bins=16)
+    assert edges[-1] == pytest.approx(np.sin(HALF), rel=1e-3)
+    assert np.nanmax(np.abs(height)) < 0.2 and np.nanmax(np.abs(field - 1)) < 0.2
+    assert np.isnan(height[0, 0])
+
+
+def test_a_layer_of_the_same_field_is_found_to_have_it():
+    hits, labels = ions_of(voltage=np.full(4000, 3000.0) + np.arange(4000) * 1e-3)
+    found = evolving(hits, labels=labels)
+    (phase,) = found.phases
+    assert found.continuations[0].way == "plane"
+    # no voltage changes: the field is that of the matrix, within the noise of 800 ions and the first shape
+    assert phase.ratio == pytest.approx(1.0, abs=0.03)
+    assert np.isfinite(phase.error) and "plane" in found.verdict and "±" in repr(found)
+
+
+@pytest.mark.parametrize(
+    ("voltage", "why"), [(None, "no voltage"), (np.full(4000, 3000.0), "constant voltage of 3000 V")]
+)
+def test_a_phase_at_the_rim_without_a_voltage_is_left_to_the_cap(voltage, why):
+    hits, labels = ions_of(voltage=voltage)
+    found, cap = evolving(hits, labels=labels), ae.reconstruct(hits, radius=13.0, **KNOWN)
+    assert found.verdict.startswith("cap: a phase reaches the rim of the field of view, 1.00 of the ring")
+    assert why in found.verdict and found.history is None
+    np.testing.assert_array_equal(found.positions, cap.positions)
+    np.testing.assert_array_equal(found.depths, cap.depths)
+
+
+def test_few_ions_wide_views_and_rolled_ions_are_left_to_the_cap():
+    hits, labels = ions_of(50, voltage=varying(50))
+    assert evolving(hits, labels=labels).verdict == "cap: 50 ions, fewer than 2,000"
+    hits, _ = ions_of(half=1.1)
+    assert evolving(hits).verdict == "cap: a half angle of 63 degrees on the cap, above 60"
+    hits, _ = ions_of()
+    rolled = replace(hits, x=hits.x * np.hypot(hits.x, hits.y) / 60, y=hits.y * np.hypot(hits.x, hits.y) / 60)
+    assert "density of the matrix on the detector has a contrast of" in evolving(rolled).verdict
+
+
+def test_wrong_input_is_one_sentence():
+    hits, labels = ions_of(voltage=varying(), extra={"element": np.array(["Al", "Mg"])[np.arange(4000) % 2]})
+    for changes, sentence in (
+        ({"labels": np.zeros(4000, int)}, "labels must mark at least two phases, got 0 for all 4,000 ions"),
+        ({"labels": labels[:10]}, "labels must have shape"),
+        ({"labels": labels, "solutes": ("Mg",)}, "labels and solutes exclude each other"),
+        ({"solutes": ("Zn",)}, "solutes must be species of the ranges, got 'Zn'"),
+        ({"protocol": "bas"}, 'protocol must be "cap" with shape="evolving"'),
+    ):
+        with pytest.raises(ValueError, match=sentence.replace("(", r"\(")):
+            evolving(hits, **changes)
+    with pytest.raises(ValueError, match="need ranges, or the elements of simulated ions"):
+        evolving(replace(hits, extra={}), solutes=("Mg",))
+    with pytest.raises(ValueError, match='solutes are for shape="evolving"'):
+        ae.reconstruct(hits, radius=13.0, solutes=("Mg",), **KNOWN)
+    with pytest.raises(ValueError, match="shape must be one of"):
+        ae.reconstruct(hits, radius=13.0, shape="ball", **KNOWN)
+    wrong = replace(hits, pulse_id=np.append(np.arange(3999), 7))
+    with pytest.raises(ValueError, match="in the sequence of evaporation, got pulse_id 7 after 3998 at ion 3999"):
+        evolving(wrong)
+
+
+def test_solutes_without_a_contrast_change_nothing():
+    rng = np.random.default_rng(4)
+    elements = np.where(rng.random(4000) < 0.05, "Mg", "Al")
+    hits, _ = ions_of(voltage=varying(), extra={"element": elements})
+    plain, found = evolving(hits), evolving(hits, solutes=("Mg",))
+    assert "no solute has a contrast over its noise" in found.verdict
+    assert abs(found.phases[0].contrast) < 3
+    np.testing.assert_array_equal(found.positions, plain.positions)
+
+
+def test_the_radius_grows_on_a_shank_and_follows_the_voltage_otherwise():
+    hits, _ = ions_of(voltage=3000.0 * (1 + 0.05 * np.arange(4000) / 4000))
+    shank = evolving(hits, radius="shank", initial_radius=13.0, shank_angle=5.0)
+    assert shank.radii[0] == pytest.approx(13.0, abs=0.01)
+    slope = np.sin(np.radians(5)) / (1 - np.sin(np.radians(5)))
+    assert np.polyfit(shank.depths, shank.radii, 1)[0] == pytest.approx(slope, rel=1e-6)
+    voltage = evolving(hits, evaporation_field=3000 / 13 / 3.3, radius="voltage")
+    # R is proportional to V: it grows by 5 %, a straight line through its medians
+    assert voltage.radii[-1] / voltage.radii[0] == pytest.approx(1.05, abs=0.003)
+
+
+def test_true_sites_give_errors_without_a_fit_of_the_projection():
+    hits, _ = ions_of()
+    found = evolving(hits)
+    truth = found.specimen_positions + np.array([1.0, 2.0, 3.0])
+    errors = found.errors(truth, fit=("shift",))
+    assert errors.lateral_rms == pytest.approx(0.0, abs=1e-9) and errors.depth_rms == pytest.approx(0.0, abs=1e-9)
+    np.testing.assert_allclose(found.errors(truth).lateral_rms, 0.0, atol=1e-9)
