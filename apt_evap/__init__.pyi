@@ -6,6 +6,7 @@ from . import evaporation as evaporation
 from . import fit as fit
 from . import io as io
 from . import maps as maps
+from . import measures as measures
 from . import plot as plot
 from . import reconstruction as reconstruction
 from . import simulation as simulation
@@ -47,6 +48,7 @@ from .specimen.materials import Material as Material
 from .specimen.materials import material as material
 from .specimen.tip import Tip as Tip
 from .spectra.mass_spectrum import spectrum as spectrum
+from .studies.dataset.loading import load_dataset as load_dataset
 from .workflows.compare_maps import compare as compare
 from .workflows.simulate_file import simulate as simulate
 from .workflows.twin_of_map import twin as twin

@@ -285,9 +285,14 @@ def check_pairs(value: Any, name: str, expected: str) -> list[tuple[Any, Any]]:
 
 
 def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """Hint at the most similar word in `known`, in upper or lower case; "" if none is similar."""
+    """Hint at the most similar word in `known`, in upper or lower case; "" if none is similar.
+
+    A symbol of an element must differ by one more letter at most: calcium, Ca, is not tantalum, Ta.
+    """
     lower = {name.lower(): name for name in known}
-    close = get_close_matches(str(word).lower(), lower, n=1, cutoff=0.5) if isinstance(word, str) else ()
+    text = word.lower() if isinstance(word, str) else ""
+    close = get_close_matches(text, [name for name in lower if len(name) > 2], n=1, cutoff=0.5)
+    close = get_close_matches(text, [*(name for name in lower if len(name) <= 2), *close], n=1, cutoff=0.75) or close
     return f" (did you mean {lower[close[0]]!r}?)" if close else ""
 
 

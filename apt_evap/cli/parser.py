@@ -38,6 +38,8 @@ from a simulation to its map, and to the emission energies of a measured map:
                                                      ions as an instrument would write them
   apt-evap reconstruct R5083.epos --element Si --distance 90 -o R5083.pos
                                                      positions in the specimen from the hits
+  apt-evap clusters R5083.pos --solute Cu --ranges R5083.rrng
+                                                     clusters, tested against random labels
   apt-evap run precipitate                           an example by its name; `apt-evap examples` lists all
   apt-evap sweep plan study.toml                     many simulations, on one machine or a cluster
   apt-evap explore ni111.h5 R5083.epos               both maps in the browser, with sliders for the emission
@@ -52,6 +54,7 @@ COMMANDS = {
     "info": "summarise a file",
     "spectrum": "draw and name the peaks of the mass spectrum of measured ions",
     "composition": "composition of measured ions with its errors, and what is unexplained",
+    "planes": "spacing and orientation of lattice planes in reconstructed ions",
     "index": "which crystal direction is where on a measured map",
     "start": "settings file for a simulation of a measured specimen",
     "twin": "from a measured file to a simulation of its specimen, a fit and a report",
@@ -59,6 +62,8 @@ COMMANDS = {
     "compare": "fit the emission energies of a run to a measured map",
     "export": "write ions as .epos, .pos, .nxs, .csv, .tapsim, .xyz or .vtp",
     "reconstruct": "reconstruct the positions of ions from their hits",
+    "clusters": "clusters of a solute: sizes, compositions, number density",
+    "proxigram": "composition as a function of the distance from an isosurface",
     "examples": "list the examples, or copy them",
     "completion": "print a script for completion in a shell",
     "sweep": "run many simulations of one study file, on one machine or a cluster",

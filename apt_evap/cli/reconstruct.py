@@ -53,7 +53,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--picture",
         metavar="P.png",
-        help="side view, top view, depth profile and composition; --ranges gives the species of measured ions; "
+        help="side view, top view, depth profile and composition; for an evolving shape both sections and the field "
+        "of the surface; --ranges gives the species of measured ions; "
         "default: the name of OUT with .png",
     )
     surface = parser.add_argument_group("surface")
@@ -120,7 +121,10 @@ def execute(options: argparse.Namespace) -> int:
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
     figure = None
     if options.picture is not None or len(reconstruction) >= FEWEST:
-        figure = plot.reconstruction(reconstruction, ranges)[0].figure
+        if isinstance(reconstruction, EvolvingReconstruction) and reconstruction.history is not None:
+            figure = plot.surface_history(reconstruction, ranges)[0].figure
+        else:
+            figure = plot.reconstruction(reconstruction, ranges)[0].figure
     write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
     assumed = assumptions(reconstruction, [name for name in _ASSUMED if name not in settings])

@@ -119,8 +119,8 @@ class DetectorMap:
         bins : int
             Number of bins along the longer side; approximate for quantised coordinates.
         extent : tuple of float, optional
-            x_min, x_max, y_min, y_max [mm]. By default that of the detector for the hits of a run, and that of the hits
-            for measured ions. Bins may extend slightly beyond it.
+            x_min, x_max, y_min, y_max [mm]. By default that of the detector for the hits of a run, and that of the
+            detected hits, without strays, for measured ions. Bins may extend slightly beyond it.
         position_step : {"auto", None} or tuple of float
             Quantisation step in x and y [mm]; "auto" to find it in the data, None for continuous data.
         dither_seed : int, optional

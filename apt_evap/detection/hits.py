@@ -26,6 +26,7 @@ from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.distortion import DistortionGrid
+from apt_evap.detection.strays import keep_strays, known_strays, strays_of
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.warnings import DataWarning, warn
 
@@ -203,12 +204,25 @@ class Hits:
         """Mask of the ions with an outcome of HIT and finite detector coordinates, bool of shape (n,).
 
         Missing columns are ignored: measured ions have no outcome, and those of a .pos file no detector coordinates.
+        Measured ions far outside the field of view are strays, and not detected. The field of view is found from the
+        density of the ions; an `extent` given with the ions is kept, so that none of them is a stray.
+
+        Warns
+        -----
+        DataWarning
+            If there are strays, once for the same coordinates: their number and places.
         """
         mask = np.ones(len(self), bool) if self.outcome is None else self.outcome == Outcome.HIT
         for column in (self.x, self.y):
             if column is not None:
                 mask &= np.isfinite(column)
+        if self._may_have_strays and (strays := strays_of(self.x, self.y, self.source)) is not None:
+            mask &= ~strays
         return mask
+
+    @property
+    def _may_have_strays(self):
+        return self.outcome is None and self.extent is None and self.x is not None and self.y is not None
 
     @property
     def counts(self) -> dict[Outcome, int]:
@@ -411,7 +425,11 @@ class Hits:
             selection = np.atleast_1d(index)
         columns = {name: getattr(self, name)[selection] for name in self.columns}
         extra = {name: values[selection] for name, values in self.extra.items()}
-        return Hits(**columns, extra=extra, units=self.units, source=self.source)
+        selected = Hits(**columns, extra=extra, units=self.units, source=self.source)
+        if self._may_have_strays and (known := known_strays(self.x, self.y))[0]:
+            # a part of the ions has the field of view of all
+            keep_strays(selected.x, selected.y, None if known[1] is None else known[1][selection])
+        return selected
 
     _repr_html_ = as_table
 

@@ -194,11 +194,9 @@ def _with_warning_of_size(path, parts):
 def _warn_of_size(path, content):
     """Warn if a measured map or ions are farther apart than any detector is wide."""
     if isinstance(content, Hits) and content.outcome is None and content.x is not None and content.y is not None:
-        detected = content.detected
-        size = tuple(
-            float(values.max(where=detected, initial=-np.inf)) - float(values.min(where=detected, initial=np.inf))
-            for values in (content.x, content.y)
-        )
+        size = _size(content, np.isfinite(content.x) & np.isfinite(content.y))
+        if max(size) > _WIDEST:  # perhaps by strays alone, which have a warning of their own
+            size = _size(content, content.detected)
     elif isinstance(content, DetectorMap):
         x_min, x_max, y_min, y_max = content.extent
         size = (x_max - x_min, y_max - y_min)
@@ -211,6 +209,14 @@ def _warn_of_size(path, content):
             DataWarning,
         )
     return max(size) > _WIDEST
+
+
+def _size(hits, rows):
+    """Extent of ions in x and y [mm]."""
+    return tuple(
+        float(values.max(where=rows, initial=-np.inf)) - float(values.min(where=rows, initial=np.inf))
+        for values in (hits.x, hits.y)
+    )
 
 
 def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: Any) -> None:

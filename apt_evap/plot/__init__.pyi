@@ -8,6 +8,8 @@ from .histories import voltage_curve as voltage_curve
 from .loss_figures import conditions as conditions
 from .map_figures import detector_map as detector_map
 from .map_figures import detector_maps as detector_maps
+from .measure_figures import clusters as clusters
+from .measure_figures import composition_profile as composition_profile
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
 from .paper_figures import paper_maps as paper_maps
@@ -23,3 +25,4 @@ from .specimen_figures import specimen as specimen
 from .spectra import spectrum as spectrum
 from .study_figures import score_matrix as score_matrix
 from .study_figures import side_by_side as side_by_side
+from .surface_history import surface_history as surface_history

@@ -66,7 +66,7 @@ def reconstruction(
     check_kind(result, "result", Reconstruction, "a Reconstruction, the result of reconstruct")
     if len(result) < FEWEST:
         raise ValueError(f"result must have at least {FEWEST} ions for a picture, got {len(result)}")
-    names, species = _species(result, ranges)
+    names, species = species_of(result, ranges)
     figure = new_figure((11.0, 8.4))
     figure.set_layout_engine("constrained")  # not compressed: the panels stay in their columns
     axes = figure.subplots(2, 2).ravel()
@@ -86,7 +86,7 @@ def reconstruction(
     return axes
 
 
-def _species(result, ranges):
+def species_of(result, ranges):
     """Names of the groups of ions, the most frequent first, and the group of each ion."""
     if ranges is not None:
         labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(result.hits, OUTSIDE)

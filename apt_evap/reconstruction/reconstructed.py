@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice
 from apt_evap.detection.hits import Hits
+from apt_evap.measures.interface import CompositionProfile
+from apt_evap.measures.point_cloud import Clusters, PointCloud
 from apt_evap.reconstruction.cap_geometry import CapGeometry, depths_below_apex, polar_angles, voltages_of
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
@@ -118,6 +120,30 @@ class Reconstruction:
         """
         chosen = check_choice(frame, "frame", FRAMES)
         return replace(self.hits, positions=self.positions if chosen == "depth" else self.specimen_positions)
+
+    def cloud(self, ranges: Any = None, frame: str = "depth") -> PointCloud:
+        """The reconstructed ions with their species, for measures such as `measures.PointCloud.clusters`.
+
+        Parameters
+        ----------
+        ranges : Ranges, optional
+            Ranges of mass of measured ions; by default the elements of simulated ions.
+        frame : str
+            As for `to_hits`.
+
+        Returns
+        -------
+        PointCloud
+        """
+        return PointCloud.of(self.to_hits(frame), ranges)
+
+    def clusters(self, *arguments: Any, ranges: Any = None, **options: Any) -> Clusters:
+        """Clusters of a solute, see `measures.PointCloud.clusters`; ranges as for `cloud`."""
+        return self.cloud(ranges).clusters(*arguments, **options)
+
+    def proxigram(self, *arguments: Any, ranges: Any = None, **options: Any) -> CompositionProfile:
+        """Proxigram of an isosurface, see `measures.PointCloud.proxigram`; ranges as for `cloud`."""
+        return self.cloud(ranges).proxigram(*arguments, **options)
 
     def errors(
         self,

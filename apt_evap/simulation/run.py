@@ -20,6 +20,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import Perturbation, perturbation_text
+from apt_evap.measures.point_cloud import PointCloud
 from apt_evap.simulation.observation import Observation, behind, on_detector
 from apt_evap.simulation.parts_of_runs import join_parts, select_rows
 from apt_evap.simulation.real_units import OperatingPoint, RealUnits, real_units_of
@@ -180,6 +181,23 @@ class Run(RunTable):
             If the perturbation was not flown and cannot be evaluated from the responses.
         """
         return self.observation.hits(perturbation, by_response)
+
+    def sites(self) -> PointCloud:
+        """True sites of the ions in the specimen, with z out of it, and their elements: for measures of the truth.
+
+        Returns
+        -------
+        PointCloud
+
+        Examples
+        --------
+        >>> tip = ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), solutes={"Al": 0.1}, seed=1)
+        >>> ae.Simulation(tip, seed=1).run(100).sites()
+        <PointCloud: 100 ions from 'sites of the run', 3.9 x 4.0 x 3.5 nm; Ni 51, Al 49>
+        """
+        names = tuple(dict.fromkeys(self.elements))  # phases may share an element
+        number = np.array([names.index(element) for element in self.elements])
+        return PointCloud(self.emissions.positions, number[self.species], names, source="sites of the run")
 
     def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits alone, the same as those of `hits`.

@@ -5,6 +5,7 @@ from .lattice import rotation_to_axis as rotation_to_axis
 from .ordered import Superlattice as Superlattice
 from .ordered import UnitCell as UnitCell
 from .phases import Phase as Phase
+from .regions import Box as Box
 from .regions import CoreShell as CoreShell
 from .regions import Cylinder as Cylinder
 from .regions import Ellipsoid as Ellipsoid

@@ -127,6 +127,24 @@ class Cylinder:
 
 
 @settings
+class Box:
+    """A box along the axes of the coordinates."""
+
+    lower: tuple[float, float, float] = vector("Its corner with the smallest coordinates.", 3, unit="nm")
+    upper: tuple[float, float, float] = vector("Its corner with the largest coordinates.", 3, unit="nm")
+
+    def _check(self):
+        for low, high in zip(self.lower, self.upper, strict=True):
+            check_number(high, "upper", above=low, unit="nm")
+
+    def distance(self, points: Floats) -> Floats:
+        """Distance from the boundary [nm], negative inside, shape (n,)."""
+        low, high = np.array(self.lower), np.array(self.upper)
+        beyond = np.maximum(low - points, points - high)
+        return np.where((beyond > 0).any(axis=1), lengths(np.maximum(beyond, 0.0)), beyond.max(axis=1))
+
+
+@settings
 class HalfSpace:
     """Everything on one side of a plane, such as the second grain of a bicrystal."""
 
@@ -218,7 +236,7 @@ class Union:
         return distance
 
 
-REGIONS = (Sphere, Ellipsoid, Cylinder, HalfSpace, Layer, CoreShell, Union)
+REGIONS = (Sphere, Ellipsoid, Cylinder, Box, HalfSpace, Layer, CoreShell, Union)
 """The built-in regions, which a file can contain."""
 
 

@@ -1,6 +1,5 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .dataset.dataset_settings import DatasetSettings as DatasetSettings
-from .dataset.loading import load_dataset as load_dataset
 from .dataset.making import make_dataset as make_dataset
 from .dataset.making import plan_dataset as plan_dataset
 from .dataset.set_description import verify_dataset as verify_dataset

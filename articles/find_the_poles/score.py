@@ -61,7 +61,7 @@ def main():
     options = parser.parse_args()
     wrong = {"Ni": "W", "W": "Ni", "Si": "Ni", "Ti": "W"}
     rows = []
-    data = ae.studies.load_dataset(options.set).split(options.split)
+    data = ae.load_dataset(options.set).split(options.split)
     for number in range(len(data)):
         example = data[number]
         about = example.about

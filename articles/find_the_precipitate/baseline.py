@@ -278,7 +278,7 @@ def main():
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     start = time.process_time()
-    data = ae.studies.load_dataset(options.set)
+    data = ae.load_dataset(options.set)
     train, test = ([Specimen(example) for example in data.split(name)] for name in ("train", "test"))
     for name, part in (("train", train), ("test", test)):
         ions = sum(len(s.truth) for s in part)

@@ -82,7 +82,7 @@ for row, (name, (normal, bounds, ions)) in zip(panels, CASES.items(), strict=Tru
             for positions in (sites[chosen], found[chosen]):
                 try:
                     widths.append(
-                        ae.reconstruction.interface_profile(positions @ along - place, layer[chosen], reach=0.6 * scale)
+                        ae.measures.interface_profile(positions @ along - place, layer[chosen], reach=0.6 * scale)
                     )
                 except ValueError:  # too few ions on one side
                     break

@@ -83,7 +83,7 @@ for name, positions in (("sites", sites), ("reconstruction", found)):
 profiles = {}
 for name, positions in (("sites", sites), ("reconstruction", found)):
     away = phase != 2  # the precipitate has no Ti
-    profiles[name] = ae.reconstruction.segregation_profile(
+    profiles[name] = ae.measures.segregation_profile(
         boundary.distance(positions[away]), species[away] == "Ti", reach=2.0
     )
     peak = profiles[name]

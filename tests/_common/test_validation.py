@@ -323,13 +323,13 @@ CASES = [
     row(ae.Instrument().hits, {"hits": ae.Hits(**HITS, time_of_flight=[1.0, 2.0], pulse_id=[0, 1])}, "distance"),
     row(ae.Extremal, bonds=[ae.evaporation.PairEnergies]),
     row(
-        ae.reconstruction.interface_profile,
+        ae.measures.interface_profile,
         {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
         "reach bin_width",
         distances=[[NAN, 1.0, 2.0, 3.0]],
     ),
     row(
-        ae.reconstruction.segregation_profile,
+        ae.measures.segregation_profile,
         {"distances": np.linspace(-0.9, 0.9, 60), "chosen": np.arange(60) % 3 == 0},
         "reach bin_width",
         distances=[[NAN, 1.0, 2.0, 3.0]],
@@ -788,6 +788,9 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
     taken |= {"index", "indexing", "MasterPattern", "master_patterns", "master_pattern"}  # in tests/maps
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
+    taken |= {"PointCloud", "CompositionField", "TriangleMesh", "ConvexHull", "label_clusters"}  # in tests/measures
+    taken |= {"choose_separation", "nearest_neighbours", "radial_distribution", "short_range_order"}
+    taken |= {"interfacial_excess", "ladder_diagram", "read_mesh", "clusters", "composition_profile"}  # and tests/io
     taken |= {"simulate", "compare", "twin", "spectrum", "write_rrng"}  # in tests/studies, tests/cli, tests/detection
     missing = {
         name

@@ -171,7 +171,7 @@ def test_dark_lines_do_not_divide_a_field_of_view(rng):
 def test_field_of_view_keeps_dark_poles_and_drops_stray_hits():
     x, y = disc(100_000)
     dark = np.hypot(x - 3, y) > 2
-    map = Hits(x=np.append(x[dark], 25.0), y=np.append(y[dark], 0.0)).map(bins=175)
+    map = Hits(x=np.append(x[dark], 13.0), y=np.append(y[dark], 0.0)).map(bins=175)
     grid_x, grid_y = np.meshgrid(*map.centres)
     assert map.mask[np.hypot(grid_x - 3, grid_y) < 1].all()
     assert not map.mask[grid_x > 11].any()
@@ -295,7 +295,7 @@ def test_pictures_share_a_scale_and_state_what_they_show(tmp_path):
 
 def test_what_lies_outside_is_counted():
     x, y = disc(100_000)
-    map = Hits(x=np.append(x, 25.0), y=np.append(y, 0.0)).map(bins=175)
+    map = Hits(x=np.append(x, 13.0), y=np.append(y, 0.0)).map(bins=175)
     inside = int(map.counts[map.mask].sum())
     for each in (map, map.smoothed(0.5), map.flattened(5.0)):
         assert describe(each).startswith(f"{inside:,} of 100,001 ions, ") and "of 100,001 ions" in repr(each)

@@ -134,6 +134,10 @@ def test_change_says_who_gave_it_and_leaves_the_table_alone():
 
 
 def test_unknown_name_lists_the_known_and_the_nearest():
+    for unknown in ("Ca", "CaCO3", "Xq"):  # no suggestion is better than tantalum for calcium
+        with pytest.raises(ValueError) as refused:
+            material(unknown)
+        assert "did you mean" not in str(refused.value)
     with pytest.raises(ValueError, match=r"'ni' \(did you mean 'Ni'\?\); known are Be, .*Pb"):
         material("ni")
     with pytest.raises(ValueError, match="known are"):

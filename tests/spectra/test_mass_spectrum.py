@@ -228,6 +228,7 @@ def test_a_named_spectrum_is_drawn():
 
 
 @pytest.mark.skipif(not (DATA / "W_tap.raw").exists(), reason="needs the measured tungsten, which is not distributed")
+@pytest.mark.filterwarnings("ignore:.*1 of 100,000 ions lies far outside:apt_evap.warnings.DataWarning")
 def test_measured_tungsten():
     hits = ae.read(DATA / "W_tap.raw")
     result = ae.spectrum(hits, "W", distance=305.0)

@@ -93,7 +93,7 @@ def made(tmp_path_factory):
 @pytest.mark.slow
 def test_the_ions_are_those_that_the_instrument_records(made):
     plan, folder = made
-    data = ae.studies.load_dataset(folder)
+    data = ae.load_dataset(folder)
     assert len(data) == plan.examples == 12
     for example in data:
         run = load(plan.sweep.folder_of(example.about["run"]) / "run.h5")
@@ -117,7 +117,7 @@ def test_the_ions_are_those_that_the_instrument_records(made):
 
 
 def test_examples_of_a_run_differ(made):
-    examples = [each for each in ae.studies.load_dataset(made[1]) if each.about["run"] == made[0].sweep.keys[0]]
+    examples = [each for each in ae.load_dataset(made[1]) if each.about["run"] == made[0].sweep.keys[0]]
     assert [each.about["emission"]["name"] for each in examples] == ["Unperturbed", "RollUp", "RollUp"]
     energies = [each.about["emission"]["energy"] for each in examples[1:]]
     assert energies[0] != energies[1] and all(0.005 <= energy <= 0.01 for energy in energies)
@@ -203,7 +203,7 @@ def test_poles_are_where_the_ions_around_them_arrive(tmp_path):
         instrument = f'instrument = {{ distance = 50.0, field_of_view = 80.0, projection = "{projection}" }}\n'
         plan = planned(tmp_path, study + instrument, base)
         make_dataset(plan, tmp_path / projection)
-        (example,) = ae.studies.load_dataset(tmp_path / projection)
+        (example,) = ae.load_dataset(tmp_path / projection)
         run = load(plan.sweep.folder_of(plan.sweep.keys[0]) / "run.h5")
         assert example.about["compression"] == pytest.approx(image_compression(run).compression, rel=1e-6)
         directions = np.empty((len(run), 3))
@@ -260,13 +260,13 @@ def test_runs_that_fail_are_named_or_left_out(tmp_path):
     content = make_dataset(plan, tmp_path / "set", without_failed=True)
     assert list(content["left_out"]) == [key]
     assert key in (tmp_path / "set" / "README.md").read_text()
-    assert key not in ae.studies.load_dataset(tmp_path / "set").table("examples")["run"]
+    assert key not in ae.load_dataset(tmp_path / "set").table("examples")["run"]
     assert make_dataset(plan, tmp_path / "set", without_failed=True) == content
 
 
 @pytest.mark.slow
 def test_tables_and_parts(made):
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     parts = [data.split(name) for name in SPLITS]
     assert sum(map(len, parts)) == len(data)
     runs = [set(part.table("examples")["run"]) for part in parts]
@@ -288,13 +288,13 @@ def test_tables_and_parts(made):
 def test_only_the_chosen_fields(tmp_path):
     plan = planned(tmp_path, STUDY + 'fields = ["y", "x", "poles"]\n')
     make_dataset(plan, tmp_path / "set")
-    example = ae.studies.load_dataset(tmp_path / "set")[0]
+    example = ae.load_dataset(tmp_path / "set")[0]
     assert list(example.ions) == ["x", "y"] and not example.cap and len(example.poles["x"])
 
 
 def test_data_frames(made):
     pandas = pytest.importorskip("pandas")
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     frame, table = data.frame("ions"), data.table("ions")
     assert isinstance(frame, pandas.DataFrame) and np.array_equal(frame["site_2"], table["site"][:, 2])
     assert data.frame("examples")["orientation_8"][0] == data[0].about["orientation"][2, 2]
@@ -303,7 +303,7 @@ def test_data_frames(made):
 
 def test_xarray(made):
     pytest.importorskip("xarray")
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     dataset = data.to_xarray()
     assert np.array_equal(dataset["ions_x"], data.table("ions")["x"]) and dataset["ions_x"].attrs["units"] == "mm"
     assert dataset["poles_normal"].shape == (len(data.table("poles")["x"]), 3)
@@ -316,7 +316,7 @@ def test_parquet_has_the_same_content(made, tmp_path):
     for name in ("set", "again"):
         make_dataset(plan, tmp_path / name)
     check_same(tmp_path / "set", tmp_path / "again")
-    one, other = ae.studies.load_dataset(made[1]), ae.studies.load_dataset(tmp_path / "set")
+    one, other = ae.load_dataset(made[1]), ae.load_dataset(tmp_path / "set")
     for name in one.schema:
         for column, values in one.table(name).items():
             same = other.table(name)[column]
@@ -332,7 +332,7 @@ def test_pytorch_reads_a_set(made, monkeypatch):
     lines = page[page.index("    def torch_dataset") :].split("\nWhat to observe")[0].splitlines()
     names = {}
     exec("\n".join(line[4:] for line in lines), names)
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     maps = names["torch_dataset"](data, bins=32)
     loaded = list(torch.utils.data.DataLoader(maps, batch_size=5))
     assert [len(batch) for batch, _ in loaded] == [5, 5, 2] and loaded[0][0].shape == (5, 32, 32)
@@ -407,23 +407,23 @@ def test_two_sets_with_one_relative_name_are_two(made, other, tmp_path, monkeypa
     for name, source in (("a", made[1]), ("b", other[1])):
         replaced(tmp_path / name / "set", source)
         monkeypatch.chdir(tmp_path / name)
-        loaded.append(ae.studies.load_dataset("set"))
-        assert first(loaded[-1]) == first(ae.studies.load_dataset(source))
-    assert first(loaded[0]) == first(ae.studies.load_dataset(made[1]))  # from another folder
+        loaded.append(ae.load_dataset("set"))
+        assert first(loaded[-1]) == first(ae.load_dataset(source))
+    assert first(loaded[0]) == first(ae.load_dataset(made[1]))  # from another folder
 
 
 def test_a_set_that_is_made_again_is_not_mixed_with_the_old_one(made, other, tmp_path):
-    old = ae.studies.load_dataset(replaced(tmp_path / "set", made[1]))
-    assert first(old) == first(ae.studies.load_dataset(made[1]))
+    old = ae.load_dataset(replaced(tmp_path / "set", made[1]))
+    assert first(old) == first(ae.load_dataset(made[1]))
     replaced(tmp_path / "set", other[1])
     for use in (lambda: old[0], lambda: old.split(old.shards[0]["split"])[0], lambda: old.table("ions")):
         with pytest.raises(FileError, match="the data set which was opened"):
             use()
-    assert first(ae.studies.load_dataset(tmp_path / "set")) == first(ae.studies.load_dataset(other[1]))
+    assert first(ae.load_dataset(tmp_path / "set")) == first(ae.load_dataset(other[1]))
 
 
 def test_examples_are_copies(made):
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     arrays = [("about", "axis"), ("about", "orientation"), ("ions", "x"), ("poles", "x"), ("cap", "radius")]
     before = [getattr(data[0], table)[name].copy() for table, name in arrays]
     for table, name in arrays:
@@ -433,7 +433,7 @@ def test_examples_are_copies(made):
 
 
 def test_a_loaded_set_goes_to_another_process(made):
-    data = ae.studies.load_dataset(made[1])
+    data = ae.load_dataset(made[1])
     assert first(pickle.loads(pickle.dumps(data))) == first(data)
 
 
@@ -446,7 +446,7 @@ def flipped(path, random):
 
 def everything(folder):
     """All tables, and all examples."""
-    data = ae.studies.load_dataset(folder)
+    data = ae.load_dataset(folder)
     tables = {f"{name} {column}": values for name in data.schema for column, values in data.table(name).items()}
     return tables | {
         f"{k} {column}": values for k, example in enumerate(data) for column, values in example.ions.items()
@@ -528,7 +528,7 @@ def test_changed_descriptions_are_refused_or_change_no_ion(made, tmp_path):
         (folder / "dataset.json").write_text(text)
         with_right_checksums(folder)
         with pytest.raises(FileError, match=r"dataset\.json' is not the description of a data set"):
-            ae.studies.load_dataset(folder)
+            ae.load_dataset(folder)
 
 
 @pytest.mark.parametrize("what", ["name", "link", "pipe"])
@@ -561,7 +561,7 @@ def test_nothing_outside_the_folder_is_read(made, tmp_path, what):
         message = "Not a regular file"
     for table in ("examples", "ions"):
         with pytest.raises(FileError, match=message):
-            ae.studies.load_dataset(folder).table("ions" if what == "link" else table)
+            ae.load_dataset(folder).table("ions" if what == "link" else table)
 
 
 def test_a_link_in_a_set_is_not_written_through(tmp_path):
@@ -744,8 +744,8 @@ def test_the_command_foretells_makes_and_verifies(made, tmp_path, capsys):
     assert foretold["examples"] == 12 and not (tmp_path / "study_set").exists()
     assert main(["dataset", str(tmp_path / "study.toml")]) == 0
     check_same(made[1], tmp_path / "study_set")
-    size = sum(shard["bytes"] for shard in ae.studies.load_dataset(made[1]).shards)
-    ions = sum(shard["ions"] for shard in ae.studies.load_dataset(made[1]).shards)
+    size = sum(shard["bytes"] for shard in ae.load_dataset(made[1]).shards)
+    ions = sum(shard["ions"] for shard in ae.load_dataset(made[1]).shards)
     per_ion = sum(field.bytes for field in plan.schema["ions"])
     assert ions * per_ion < size < foretold["bytes"] < 5 * size  # a fifth of the ions is recorded at least
     capsys.readouterr()

@@ -93,7 +93,7 @@ def test_a_small_set_and_its_score(tmp_path, monkeypatch):
     runpy.run_path(str(ARTICLE / "baseline.py"), run_name="__main__")
     table = json.loads(Path("out/table.json").read_text())
     assert len(table) == 2 and Path("out/find_the_precipitate.png").stat().st_size > 10_000
-    test = ae.studies.load_dataset("set").split("test")
+    test = ae.load_dataset("set").split("test")
     by_chance = np.concatenate([example.ions["phase"] for example in test]).mean()
     for method in table.values():
         for place in ("measured", "sites"):

@@ -20,7 +20,7 @@ _LOAD = """\
 ```python
 import apt_evap as ae
 
-data = ae.studies.load_dataset("FOLDER")
+data = ae.load_dataset("FOLDER")
 example = data.split("train")[0]
 example.ions["x"], example.ions["site"], example.poles["indices"]
 ```"""

@@ -303,7 +303,7 @@ class DataSet:
 
 
 def load_dataset(path: AnyPath) -> DataSet:
-    """Open a finished data set.
+    r"""Open a finished data set.
 
     Parameters
     ----------
@@ -319,6 +319,18 @@ def load_dataset(path: AnyPath) -> DataSet:
     FileError
         If it is not a finished data set. `verify_dataset` compares the checksums of all files. When a file is
         read, its checksum is compared.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> tip, ions = 'material = "Al"\napex_radius = "5 a"\nshank_length = "5 a"', "ions = 60"
+    >>> _ = Path("base.toml").write_text(f"[tip]\n{tip}\n[simulation]\n{ions}\n")
+    >>> study = 'base = "base.toml"\nsample = 1\n[sweep]\n"tip.axis" = "random"\n'
+    >>> _ = Path("study.toml").write_text(f'{study}[dataset]\nemissions = ["RollUp:0.02"]\n')
+    >>> _ = ae.studies.make_dataset(ae.studies.plan_dataset("study.toml"), "set")
+    >>> data = ae.load_dataset("set")
+    >>> data[0].about["material"], data[0].ions["site"].shape[1]
+    ('Al', 3)
     """
     folder = check_path(path).absolute()
     content = read_finished(folder)

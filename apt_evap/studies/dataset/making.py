@@ -239,7 +239,7 @@ def make_dataset(
     >>> planned
     <PlannedSet: 1 runs, 2 examples>
     >>> content = ae.studies.make_dataset(planned, "set")
-    >>> example = ae.studies.load_dataset("set")[1]
+    >>> example = ae.load_dataset("set")[1]
     >>> print(example.about["material"], example.about["emission"]["name"], example.ions["site"].shape[1])
     Al RollUp 3
     """

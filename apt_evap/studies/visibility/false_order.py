@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-import scipy
-from numpy.typing import ArrayLike
 
-from apt_evap._common.types import Booleans, Floats, Integers
+from apt_evap._common.types import Booleans, Estimated, Floats, Integers
 from apt_evap._common.validation import (
-    check_array,
     check_choice,
     check_count,
     check_kind,
@@ -22,6 +19,7 @@ from apt_evap._common.validation import (
 )
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation
+from apt_evap.measures.order import neighbour_pairs
 from apt_evap.simulation.run import Run
 from apt_evap.studies.visibility.recorded import names_of, recorded_ions
 
@@ -29,15 +27,6 @@ SHELL = 0.3
 """Radius within which ions are neighbours [nm]: between the first and the second neighbours of fcc metals."""
 
 _RESAMPLES = 400  # of the bootstrap: 4 % of an error
-
-
-class Estimated(NamedTuple):
-    """A number and its standard deviation."""
-
-    value: float
-    """The number."""
-    error: float
-    """Its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -67,43 +56,6 @@ class FalseOrder:
         """The reconstructed parameter of unlike pairs, -alpha x / (1 - x), which is negative for ordering."""
         factor = self.solutes / (self.ions - self.solutes)
         return Estimated(-factor * self.reconstructed.value, factor * self.reconstructed.error)
-
-
-def warren_cowley(positions: ArrayLike, solute: ArrayLike, shell: float = SHELL) -> float:
-    r"""Warren-Cowley parameter of the ions within a distance.
-
-    Parameters
-    ----------
-    positions : array_like
-        Positions [nm], shape (n, 3).
-    solute : array_like of bool
-        Which ions are solutes, shape (n,).
-    shell : float
-        Largest distance of neighbours [nm].
-
-    Returns
-    -------
-    float
-        0 for a random alloy; negative if solutes have more solutes as neighbours, 1 if they have none. NaN without
-        neighbours.
-
-    Notes
-    -----
-    :math:`\alpha = 1 - p / x`, with the fraction p of solutes among the neighbours of solutes, and the fraction x among
-    all ions. This is the parameter of like pairs. That of unlike pairs is :math:`1 - (1 - p) / (1 - x) = -\alpha x / (1
-    - x)` (J. M. Cowley, Phys. Rev. 77, 669 (1950)).
-
-    Examples
-    --------
-    >>> chain = np.column_stack([0.25 * np.arange(100), np.zeros(100), np.zeros(100)])
-    >>> from apt_evap.studies.visibility.false_order import warren_cowley
-    >>> warren_cowley(chain, np.arange(100) % 2 == 0)
-    1.0
-    """
-    places = check_array(positions, "positions", ("n", 3))
-    solutes = check_array(solute, "solute", (len(places),), dtype=bool)
-    pairs = _pairs(places, check_number(shell, "shell", above=0, unit="nm"))
-    return _parameter(*_counts(pairs, solutes), solutes.mean())
 
 
 def false_order(
@@ -180,7 +132,7 @@ def false_order(
 
 def _pairs(positions: Floats, shell: float) -> Integers:
     """Rows of neighbours in both orders, shape (m, 2)."""
-    pairs = scipy.spatial.cKDTree(positions).query_pairs(shell, output_type="ndarray")
+    pairs = neighbour_pairs(positions, shell)
     return np.concatenate([pairs, pairs[:, ::-1]])
 
 

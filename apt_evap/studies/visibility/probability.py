@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from apt_evap._common.types import Booleans, Floats, Integers
+from apt_evap._common.types import Booleans, Estimated, Floats, Integers
 from apt_evap._common.validation import (
     check_array,
     check_choice,
@@ -28,7 +28,6 @@ from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.regions import Layer, Sphere
 from apt_evap.specimen.tip import Tip
 from apt_evap.studies.visibility.cases import check_feature, simulated, size_of, specimen_of, values_of, varied
-from apt_evap.studies.visibility.false_order import Estimated
 from apt_evap.studies.visibility.operators import OriginOperators, origin_operators
 from apt_evap.studies.visibility.recorded import Ions, recorded_ions
 

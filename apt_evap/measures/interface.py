@@ -1,4 +1,4 @@
-"""Composition about an interface: width of a step, and excess of a segregated element."""
+"""Composition about an interface: profiles, width of a step, segregation, interfacial excess, ladder diagram."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.codec import for_json
-from apt_evap._common.types import Booleans, Floats, Integers
-from apt_evap._common.validation import check_array, check_number
+from apt_evap._common.types import Booleans, Estimated, Floats, Integers
+from apt_evap._common.validation import check_array, check_choice, check_number
 
 _TEN_TO_NINETY = 2.5631031310892007  # 10 to 90 % of an error function in sigma, 2 sqrt(2) erfinv(0.8)
 _FEWEST = 10  # ions on each side: the fits have four constants
@@ -57,6 +57,73 @@ class DistanceProfile:
         dict
         """
         return for_json(vars(self))
+
+
+@dataclass(frozen=True, eq=False)
+class CompositionProfile:
+    """Composition as a function of a coordinate: a proxigram if this is the distance from an isosurface.
+
+    Parameters
+    ----------
+    edges : ndarray
+        Edges of the steps [nm], shape (n + 1,).
+    elements : tuple of str
+        Names of the elements, e of them.
+    atoms : ndarray
+        Number of atoms of each element in each step, shape (n, e).
+    coordinates : ndarray
+        Coordinate of each ion [nm], shape (m,); NaN for an ion that does not count.
+    area : float
+        Area of the surface that the coordinate is the distance from, or of the cross section [nm^2]; NaN if not known.
+    """
+
+    edges: Floats = field(repr=False)
+    elements: tuple[str, ...]
+    atoms: Floats = field(repr=False)
+    coordinates: Floats = field(repr=False)
+    area: float = math.nan
+
+    @property
+    def centres(self) -> Floats:
+        """Centres of the steps [nm], shape (n,)."""
+        return (self.edges[:-1] + self.edges[1:]) / 2
+
+    @property
+    def fractions(self) -> Floats:
+        """Fraction of each element in each step, shape (n, e); NaN without atoms."""
+        with np.errstate(invalid="ignore"):
+            return self.atoms / self.atoms.sum(axis=1, keepdims=True)
+
+    @property
+    def fraction_errors(self) -> Floats:
+        """Standard deviation of each fraction by the number of atoms, shape (n, e); NaN without atoms."""
+        with np.errstate(invalid="ignore"):
+            return np.sqrt(self.fractions * (1 - self.fractions) / self.atoms.sum(axis=1, keepdims=True))
+
+    def of(self, element: str) -> DistanceProfile:
+        """Profile of one element.
+
+        Parameters
+        ----------
+        element : str
+            Its name.
+
+        Returns
+        -------
+        DistanceProfile
+        """
+        column = self.elements.index(check_choice(element, "element", self.elements))
+        return DistanceProfile(self.edges, self.atoms.sum(axis=1), self.fractions[:, column])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Edges, elements, atoms, fractions and errors as numbers and lists, for JSON.
+
+        Returns
+        -------
+        dict
+        """
+        names = ("edges", "elements", "atoms", "fractions", "fraction_errors", "area")
+        return for_json({name: getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +283,105 @@ def segregation_profile(
         edges, ions, fraction, centre, float(errors[0]), width, float(errors[1]), bulk, peak, excess,
         math.sqrt(float(variance)),
     )  # fmt: skip
+
+
+def interfacial_excess(
+    distances: ArrayLike,
+    chosen: ArrayLike,
+    area: float,
+    window: float = 1.0,
+    reach: float = 3.0,
+    efficiency: float = 1.0,
+) -> Estimated:
+    r"""Interfacial excess of an element, by the Gibbs dividing surface.
+
+    Parameters
+    ----------
+    distances, chosen
+        As for `interface_profile`.
+    area : float
+        Area of the interface [nm^2].
+    window : float
+        The interface is within this distance [nm].
+    reach : float
+        Ions from the window to this distance give the compositions of both sides [nm].
+    efficiency : float
+        Fraction of the atoms that was detected.
+
+    Returns
+    -------
+    Estimated
+        Excess [atoms / nm^2] and its standard deviation by the number of ions.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 10 ions on each side beyond the window.
+
+    Notes
+    -----
+    :math:`\Gamma = (N_s - x_a N_- - x_b N_+) / (A \eta)`, with the atoms of the element within the window, the atoms
+    on both sides of the surface within it, and the fractions beyond it (Krakauer and Seidman, Phys. Rev. B 48, 6724
+    (1993)). Its variance is that of the binomial distributions of the three counts.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> distances = 8 * rng.random(40_000) - 4
+    >>> chosen = rng.random(40_000) < 0.02 + 0.2 * np.exp(-0.5 * (distances / 0.3) ** 2)
+    >>> excess = ae.measures.interfacial_excess(distances, chosen, area=100.0)
+    >>> print(f"{excess.value:.1f} +/- {excess.error:.1f} of {0.2 * 0.3 * np.sqrt(2 * np.pi) * 50:.1f} atoms / nm^2")
+    7.1 +/- 0.3 of 7.5 atoms / nm^2
+    """
+    window = check_number(window, "window", above=0, unit="nm")
+    reach = check_number(reach, "reach", above=window, unit="nm")
+    area = check_number(area, "area", above=0, unit="nm^2")
+    efficiency = check_number(efficiency, "efficiency", above=0, at_most=1)
+    along = check_array(distances, "distances", ("n",), finite=False)
+    counts = check_array(chosen, "chosen", (len(along),), dtype=bool)
+    inside = np.abs(along) <= window
+    excess = float(np.count_nonzero(counts & inside))
+    ions = max(int(np.count_nonzero(inside)), 1)
+    variance = excess * (1 - excess / ions)
+    for side, beyond in ((along < 0, along < -window), (along >= 0, along > window)):
+        far = counts[beyond & (np.abs(along) <= reach)]
+        if len(far) < _FEWEST:
+            raise ValueError(
+                f"distances must have at least {_FEWEST} ions on each side between window = {window:g} and reach = "
+                f"{reach:g} nm, got {len(far)}"
+            )
+        fraction, near = float(far.mean()), int(np.count_nonzero(side & inside))
+        excess -= fraction * near
+        variance += fraction * (1 - fraction) / len(far) * near**2
+    return Estimated(excess / (area * efficiency), math.sqrt(variance) / (area * efficiency))
+
+
+def ladder_diagram(distances: ArrayLike, chosen: ArrayLike) -> tuple[Floats, Integers]:
+    """Ladder diagram: number of chosen ions over the number of all ions, along a coordinate.
+
+    Parameters
+    ----------
+    distances : array_like
+        Coordinate of each ion [nm], shape (n,), such as the distance from an interface. Ions with NaN are left out.
+    chosen : array_like of bool
+        The ions that count, shape (n,).
+
+    Returns
+    -------
+    distances : ndarray
+        Coordinates in increasing order [nm]; their ranks are the number of all ions.
+    counted : ndarray of int
+        Number of chosen ions up to each of them: the slope is their fraction, a step is an excess.
+
+    Examples
+    --------
+    >>> ae.measures.ladder_diagram([0.3, 0.1, 0.2], [True, True, False])
+    (array([0.1, 0.2, 0.3]), array([1, 1, 2]))
+    """
+    along = check_array(distances, "distances", ("n",), finite=False)
+    counts = check_array(chosen, "chosen", (len(along),), dtype=bool)
+    order = np.argsort(along, kind="stable")[: np.count_nonzero(np.isfinite(along))]
+    return along[order], np.cumsum(counts[order])
 
 
 def _near(distances: ArrayLike, chosen: ArrayLike, reach: float) -> tuple[Floats, Booleans]:

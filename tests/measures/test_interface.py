@@ -20,7 +20,7 @@ def ions(model, seed=1):
 
 @pytest.mark.parametrize(("sigma", "before", "after"), [(0.1, 0.95, 0.05), (0.4, 0.2, 0.7)])
 def test_the_width_of_a_step(sigma, before, after):
-    found = ae.reconstruction.interface_profile(
+    found = ae.measures.interface_profile(
         *ions(lambda d: before + (after - before) * ndtr((d - 0.2) / sigma)), reach=2.0, bin_width=0.25
     )
     # four standard errors: one of 16,000 fits fails
@@ -35,7 +35,7 @@ def test_the_width_of_a_step(sigma, before, after):
 @pytest.mark.slow
 def test_errors_are_those_of_repeated_measurements():
     def once(seed):
-        return ae.reconstruction.interface_profile(*ions(lambda d: 0.1 + 0.8 * ndtr(d / 0.3), seed), reach=1.5)
+        return ae.measures.interface_profile(*ions(lambda d: 0.1 + 0.8 * ndtr(d / 0.3), seed), reach=1.5)
 
     found = [once(seed) for seed in range(30)]
     spread = np.std([each.sigma for each in found], ddof=1)
@@ -45,15 +45,13 @@ def test_errors_are_those_of_repeated_measurements():
 
 def test_a_sharp_step_has_no_width():
     distances = np.linspace(-1.005, 1.005, 202)
-    found = ae.reconstruction.interface_profile(distances, distances > 0)
+    found = ae.measures.interface_profile(distances, distances > 0)
     assert found.width < 0.02  # two distances of the ions
     assert (found.before, found.after) == pytest.approx((0, 1), abs=0.02)
 
 
 def test_the_excess_of_a_segregated_element():
-    found = ae.reconstruction.segregation_profile(
-        *ions(lambda d: 0.02 + 0.2 * np.exp(-(d**2) / (2 * 0.35**2))), reach=2.5
-    )
+    found = ae.measures.segregation_profile(*ions(lambda d: 0.02 + 0.2 * np.exp(-(d**2) / (2 * 0.35**2))), reach=2.5)
     assert abs(found.width - 0.35) < 4 * found.width_error < 0.1
     assert abs(found.centre) < 4 * found.centre_error < 0.1
     assert (found.bulk, found.peak) == pytest.approx((0.02, 0.22), abs=0.03)
@@ -62,7 +60,7 @@ def test_the_excess_of_a_segregated_element():
 
 
 def test_results_are_json():
-    found = ae.reconstruction.segregation_profile(*ions(lambda d: 0.05 + 0.2 * np.exp(-(d**2))))
+    found = ae.measures.segregation_profile(*ions(lambda d: 0.05 + 0.2 * np.exp(-(d**2))))
     content = json.loads(json.dumps(found.to_dict()))
     assert content["excess"] == found.excess and len(content["fraction"]) == len(content["edges"]) - 1
 
@@ -70,10 +68,41 @@ def test_results_are_json():
 def test_refusals():
     distances, chosen = ions(lambda d: 0.5 + 0 * d)
     with pytest.raises(ValueError, match="at least 10 ions on each side within 1 nm, got 0 and"):
-        ae.reconstruction.interface_profile(np.abs(distances), chosen)
+        ae.measures.interface_profile(np.abs(distances), chosen)
     with pytest.raises(ValueError, match="chosen"):
-        ae.reconstruction.interface_profile(distances, np.zeros(N, bool))
+        ae.measures.interface_profile(distances, np.zeros(N, bool))
     with pytest.raises(ValueError, match="reach"):
-        ae.reconstruction.segregation_profile(distances, chosen, reach=0)
+        ae.measures.segregation_profile(distances, chosen, reach=0)
     with pytest.raises(ValueError, match="bin_width"):
-        ae.reconstruction.interface_profile(distances, chosen, bin_width=3.0)
+        ae.measures.interface_profile(distances, chosen, bin_width=3.0)
+
+
+def test_the_intervals_of_the_excess_cover_the_truth():
+    """A segregation of 0.1 nm 50 nm^-3 = 5 atoms / nm^2 less the bulk, 1000 times: 95 % intervals cover 95 %."""
+    covered, values, density, area = 0, [], 50.0, 60.0
+    true = (0.25 - 0.03) * 0.3 * np.sqrt(2 * np.pi) * density
+    for seed in range(1000):
+        rng = np.random.default_rng(seed)
+        n = rng.poisson(density * area * 8 * 0.4)  # of an efficiency of 0.4
+        distances = 8 * rng.random(n) - 4
+        chosen = rng.random(n) < 0.03 + 0.22 * np.exp(-0.5 * (distances / 0.3) ** 2)
+        excess = ae.measures.interfacial_excess(distances, chosen, area, window=1.2, reach=4.0, efficiency=0.4)
+        covered += abs(excess.value - true) <= 1.96 * excess.error
+        values.append(excess.value)
+    assert 930 <= covered <= 975  # three standard deviations of 950 are 21
+    assert np.mean(values) == pytest.approx(true, rel=0.01)  # 0.3 % by the draws
+
+
+def test_a_step_without_segregation_has_no_excess():
+    rng = np.random.default_rng(1)
+    distances = 6 * rng.random(50_000) - 3
+    excess = ae.measures.interfacial_excess(distances, rng.random(50_000) < np.where(distances < 0, 0.7, 0.1), 100.0)
+    assert abs(excess.value) < 3 * excess.error
+    with pytest.raises(ValueError, match="at least 10 ions on each side between window = 1 and reach = 3 nm, got 0"):
+        ae.measures.interfacial_excess(np.abs(distances), distances > 1, 100.0)
+
+
+def test_the_ladder_rises_by_the_excess():
+    distances = np.array([0.2, -0.1, np.nan, 0.1, -0.3])
+    places, counted = ae.measures.ladder_diagram(distances, np.array([True, True, True, False, False]))
+    assert places.tolist() == [-0.3, -0.1, 0.1, 0.2] and counted.tolist() == [0, 1, 1, 2]

@@ -1,37 +1,9 @@
-"""Warren-Cowley parameter and the apparent order by evaporation."""
+"""The apparent order by evaporation."""
 
 import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.specimen.lattice import Lattice, lattice_sites_in
-from apt_evap.studies.visibility.false_order import warren_cowley
-
-A = 0.352  # nm
-
-
-@pytest.fixture(scope="module")
-def cube():
-    """Sites of an fcc cube of 8 cells, and their corner of the cell."""
-    sites, _ = lattice_sites_in(
-        Lattice("fcc", A, None, np.eye(3), np.zeros(3)), lambda points: np.abs(points).max(axis=1) - 4 * A,
-        [[-4 * A] * 3, [4 * A] * 3], tolerance=1e-6,
-    )  # fmt: skip
-    return sites, np.all(np.isclose(np.mod(sites / A + 0.01, 1), 0.01, atol=1e-3), axis=1)
-
-
-def test_a_perfect_order_has_no_like_neighbours(cube):
-    sites, corners = cube
-    assert warren_cowley(sites, corners) == 1.0
-
-
-def test_the_parameter_is_that_of_a_double_loop(cube):
-    sites = cube[0][::3]
-    solute = np.random.default_rng(1).random(len(sites)) < 0.2
-    distances = np.linalg.norm(sites[:, None] - sites, axis=2)
-    near = (distances <= 0.4) & (distances > 0)
-    like = near[solute][:, solute].sum() / near[solute].sum()
-    assert warren_cowley(sites, solute, 0.4) == pytest.approx(1 - like / solute.mean(), abs=1e-12)
 
 
 @pytest.fixture(scope="module")

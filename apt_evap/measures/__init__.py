@@ -1,0 +1,5 @@
+"""Measures of ions with positions: regions, clusters, composition fields, proxigrams, interfaces, order."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

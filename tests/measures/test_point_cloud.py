@@ -1,0 +1,191 @@
+"""Point clouds: selection, molecules, profiles, the proxigram of a blurred ball, columns of clusters."""
+
+import numpy as np
+import pytest
+from scipy.special import erf
+
+import apt_evap as ae
+
+RADIUS, BLUR = 2.0, 0.3  # nm
+
+
+def blurred_ball(seed, ions=100_000, inside=0.8, outside=0.05):
+    """Ions in a box: copper within a ball, then all positions with a Gaussian error."""
+    rng = np.random.default_rng(seed)
+    sites = 9 * rng.random((ions, 3)) - 4.5
+    copper = rng.random(ions) < np.where(np.linalg.norm(sites, axis=1) < RADIUS, inside, outside)
+    positions = sites + BLUR * rng.normal(size=sites.shape)
+    return ae.measures.PointCloud(positions, copper.astype(int), ["Al", "Cu"])
+
+
+def blurred_fraction(distance):
+    """Fraction of what was in the ball, at a distance from its surface: the ball convolved with a Gaussian."""
+    r, s = RADIUS + distance, BLUR
+    shell = (erf((RADIUS - r) / (np.sqrt(2) * s)) + erf((RADIUS + r) / (np.sqrt(2) * s))) / 2
+    tails = np.exp(-((RADIUS - r) ** 2) / (2 * s * s)) - np.exp(-((RADIUS + r) ** 2) / (2 * s * s))
+    return shell - s / (r * np.sqrt(2 * np.pi)) * tails
+
+
+def test_the_proxigram_of_a_ball_is_its_convolution():
+    profile = blurred_ball(1).proxigram(surface=ae.specimen.Sphere((0, 0, 0), RADIUS), step=0.1, reach=1.5)
+    copper = profile.of("Cu")
+    expected = 0.05 + 0.75 * blurred_fraction(copper.centres)
+    errors = np.sqrt(expected * (1 - expected) / copper.ions)
+    chi2 = (((copper.fraction - expected) / errors) ** 2).sum()
+    assert len(copper.ions) == 30 and 12 < chi2 < 57  # 30 degrees of freedom, with probabilities of 0.1 % outside
+
+
+def test_the_proxigram_about_the_isosurface_differs_by_the_shift_of_the_surface():
+    cloud = blurred_ball(1, 60_000)
+    profile = cloud.proxigram("Cu", 0.425, voxel=0.4, delocalisation=0.4, step=0.1, reach=1.5, largest=True)
+    fit = ae.measures.interface_profile(
+        profile.coordinates[np.isfinite(profile.coordinates)],
+        cloud.mark("Cu")[np.isfinite(profile.coordinates)],
+        reach=1.5,
+    )
+    # delocalisation and voxels move the surface inward by their variance over the radius beyond the blur alone
+    assert fit.centre == pytest.approx((0.4**2 + 0.4**2 / 12) / RADIUS, abs=0.05)
+    # the surface follows the noise of the counts, by less than the blur
+    assert fit.sigma == pytest.approx(BLUR, abs=0.06)
+    assert fit.before == pytest.approx(0.8, abs=0.04) and fit.after == pytest.approx(0.05, abs=0.01)
+    assert profile.area == pytest.approx(4 * np.pi * (RADIUS - 0.12) ** 2, rel=0.12)
+
+
+def test_selections_by_regions():
+    cloud = blurred_ball(2, 5000)
+    ball, layer = ae.specimen.Sphere((0, 0, 0), 2.0), ae.specimen.Layer(-1.0, 1.0)
+    assert len(cloud.select(ball)) == (np.linalg.norm(cloud.positions, axis=1) <= 2.0).sum()
+    assert np.array_equal(cloud.select(layer).positions, cloud.select(np.abs(cloud.positions[:, 2]) <= 1.0).positions)
+    assert len(cloud.select(lambda points: points[:, 0] > 0)) == (cloud.positions[:, 0] > 0).sum()
+    assert len(cloud.select(slice(10))) == 10 and len(cloud.select([3, 1])) == 2
+    assert len(cloud.select(cloud.hull)) == 5000
+    assert cloud.select(ball).fractions()["Cu"].value == pytest.approx(
+        cloud.mark("Cu")[np.linalg.norm(cloud.positions, axis=1) <= 2.0].mean()
+    )
+
+
+def test_molecules_are_taken_apart():
+    cloud = ae.measures.PointCloud(
+        np.arange(15.0).reshape(5, 3) ** 1.5,
+        [0, 0, 1, 2, -1],
+        ["Cr", "CrO2", "N2"],
+        [{"Cr": 1}, {"Cr": 1, "O": 2}, {"N": 2}],
+    )
+    assert cloud.count_atoms() == {"Cr": 3, "O": 2, "N": 2}
+    assert cloud.mark("Cr").tolist() == [True, True, True, False, False]
+    assert cloud.mark(["CrO2", "N"]).tolist() == [False, False, True, True, False]
+    assert cloud.fractions()["O"].value == pytest.approx(2 / 7)
+    assert cloud.fractions()["O"].error == pytest.approx(np.sqrt(2 / 7 * 5 / 7 / 7))
+    assert cloud.profile(step=100.0).atoms.sum(axis=0).tolist() == [3, 2, 2]
+    assert "in no range 1" in repr(cloud)
+    field = cloud.field("O", voxel=100.0, delocalisation=0.0)
+    assert field.fraction[1, 1, 1] == pytest.approx(2 / 7)
+
+
+def test_ions_of_files_with_ranges():
+    ranges = ae.spectra.Ranges(
+        ["CrO", "Cr", "CrO"],
+        [67.0, 51.0, 33.0],
+        [69.0, 53.0, 35.0],
+        composition=[{"Cr": 1, "O": 1}, {"Cr": 1}, {"Cr": 1, "O": 1}],
+    )
+    ions = ae.Hits(positions=[[0, 0, 0], [0, 0, 1], [0, np.nan, 0], [1, 1, 1.0]], mass_to_charge=[68, 52, 52, 99.0])
+    cloud = ae.measures.PointCloud.of(ions, ranges)
+    assert len(cloud) == 3 and cloud.species.tolist() == [0, 1, -1]
+    assert cloud.count_atoms() == {"Cr": 2, "O": 1}
+    assert ae.measures.PointCloud.of(ions).names == ("ion",)
+    with pytest.raises(ValueError, match="positions"):
+        ae.measures.PointCloud.of(ae.Hits(x=[0.0], y=[1.0]))
+
+
+def test_a_profile_counts_all_ions_of_a_region():
+    cloud = blurred_ball(3, 20_000)
+    tube = ae.specimen.Cylinder((0, 0, 0), 1.0, axis=(1, 0, 0))
+    profile = cloud.profile((2, 0, 0), step=0.5, region=tube)
+    assert profile.atoms.sum() == len(cloud.select(tube))
+    assert profile.of("Cu").fraction[len(profile.centres) // 2] > 0.7
+    assert profile.fractions.sum(axis=1) == pytest.approx(1.0)
+
+
+def test_columns_of_clusters():
+    rng = np.random.default_rng(5)
+    matrix = 10 * rng.random((20_000, 3))
+    balls = [
+        centre + radius * rng.normal(size=(n, 3)) / np.sqrt(5)
+        for centre, radius, n in (([3, 3, 3], 1.0, 300), ([7, 7, 7], 0.8, 150), ([5, 5, 10], 0.8, 150))
+    ]
+    cloud = ae.measures.PointCloud(
+        np.concatenate([matrix, *balls]), np.r_[np.zeros(20_000, int), np.ones(600, int)], ["Al", "Cu"]
+    )
+    clusters = cloud.clusters("Cu", 0.5, 20)
+    assert len(clusters) == 3
+    assert np.array_equal(clusters.at_edge, clusters.centres[:, 2] > 9)  # the one cut by the face
+    assert clusters.solutes[0] > 290
+    np.testing.assert_allclose(clusters.centres[0], [3, 3, 3], atol=0.1)  # 0.45 / sqrt(300) = 0.03 nm
+    assert clusters.radii[0] == pytest.approx(1.0, abs=0.12)  # 0.03 nm by counting, and strays beyond 0.5 nm
+    density = clusters.number_density(1000.0)
+    assert density.value == pytest.approx(2.5e-3) and density.error == pytest.approx(np.sqrt(2.5) / 1000)
+    wide = cloud.clusters("Cu", 0.5, 20, envelope=0.3, erosion=0.0)
+    assert wide.sizes[0] > clusters.sizes[0] and np.array_equal(wide.solutes, clusters.solutes)
+    assert wide.fractions()["Cu"].value == pytest.approx(wide.cloud.mark("Cu")[wide.labels >= 0].mean())
+    assert wide.atoms.sum() + sum(cloud.select(wide.labels < 0).count_atoms().values()) == len(cloud)
+    np.testing.assert_allclose(wide.compositions.sum(axis=1), 1.0)
+    assert wide.to_dict()["solutes"] == wide.solutes.tolist()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.clusters("Ag"), "solute must be one of Al, Cu, got 'Ag'"),
+        (lambda c: c.select(c.species == 0).clusters("Cu"), "solute must mark at least one ion, got no Cu in"),
+        (lambda c: c.select([0, 1]).clusters("Al"), "at least 10 of the ions"),
+        (lambda c: c.select([0, 1]).proxigram("Al", 0.5), "isovalue must be within|no Al in 2 ions"),
+        (lambda c: c.proxigram("Cu", 0.999, delocalisation=1.0), "isovalue must be within the fractions of voxels"),
+        (lambda c: c.proxigram("Cu"), "a proxigram needs a solute and an isovalue, or a surface"),
+        (lambda c: c.proxigram(surface=lambda p: p), "surface must be a TriangleMesh, or a region"),
+        (lambda c: c.profile((0, 0, 0)), "length of axis must be"),
+        (lambda c: c.profile(region=ae.specimen.Sphere((99, 0, 0), 1)), "at least one ion in the region, got none"),
+        (lambda c: c.select([0.5]), "where must"),
+        (lambda c: ae.measures.PointCloud([[0, 0, 0]], [2], ["Al"]), "species must be from -1 to 0, got 2 to 2"),
+        (lambda c: ae.measures.PointCloud([[0, 0, np.nan]], [0], ["Al"]), "positions must be finite"),
+    ],
+)
+def test_wrong_arguments_are_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(blurred_ball(1, 2000))
+
+
+def test_sites_of_a_run_and_its_reconstruction():
+    """The same measure of both: elements of two phases are one, and a perfect position has the same neighbours."""
+    core = ae.specimen.Phase("core", "Ni", ae.specimen.Sphere((0, 0, 2.0), 0.8), solutes={"Al": 0.5})
+    tip = ae.Tip(phases=[ae.specimen.Phase("matrix", "Ni", solutes={"Al": 0.05}), core], apex_radius=2.5, seed=1)
+    run = ae.Simulation(tip, seed=1).run(300, [ae.Unperturbed()], responses=False, progress=False)
+    sites = run.sites()
+    assert sites.names == ("Ni", "Al") and len(sites) == 300
+    assert sites.mark("Al").sum() == sum(run.elements[k] == "Al" for k in run.species)
+    assert np.array_equal(sites.positions, run.emissions.positions)
+    hits = run.hits(ae.Unperturbed())
+    volume = ae.reconstruct(hits, radius=2.5, atomic_volume=0.011, distance=100.0, detector_radius=80.0)
+    cloud = volume.cloud(frame="specimen")
+    assert cloud.names == ("Al", "Ni") and np.array_equal(cloud.positions, volume.specimen_positions)
+    assert cloud.mark("Al").sum() == (volume.hits.extra["element"] == "Al").sum()
+    clusters = volume.clusters("Al", 0.3, 3)
+    assert np.array_equal(clusters.members, volume.cloud().clusters("Al", 0.3, 3).members)
+    profile = volume.proxigram(surface=ae.specimen.HalfSpace((0, 0, 0.3), (0, 0, 1)), reach=0.5)
+    assert 0 < profile.atoms.sum() < len(volume)
+
+
+def test_pictures():
+    cloud = blurred_ball(3, 20_000)
+    clusters = cloud.clusters("Cu", 0.4, 50)
+    axes = ae.plot.clusters(clusters)
+    assert axes[2].get_xlabel() == "solutes of a cluster" and axes[0].get_aspect() == 1
+    ax = ae.plot.composition_profile(cloud.proxigram(surface=ae.specimen.Sphere((0, 0, 0), RADIUS)), "Cu")
+    (line,) = (container[0] for container in ax.containers)
+    x, y = line.get_data()
+    inner = y[(x > -1.2) & (x < -0.6)].mean()
+    assert inner == pytest.approx(80 - 3, abs=4)  # per cent; two and more blurs inside, 500 ions: three errors of 1.8
+    with pytest.raises(ValueError, match="elements must be one of Al, Cu, got 'Ag'"):
+        ae.plot.composition_profile(cloud.profile(), "Ag")
+    with pytest.raises(ValueError, match="result must be Clusters"):
+        ae.plot.clusters(cloud)
