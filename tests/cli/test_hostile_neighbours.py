@@ -111,6 +111,7 @@ RUNS = {
     "map": [("map", "run.h5"), ("map", "ions.epos"), ("map", "map.npz")],
     "info": [("info", "run.h5"), ("info", "ions.epos"), ("info", "map.npz")],
     "spectrum": [("spectrum", "ions.epos")],
+    "planes": [("planes", "ions.epos")],
     "composition": [("composition", "ions.epos")],
     "index": [("index", "ions.epos", "--element", "Ni", "--scales", "50,50")],
     "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50")],
