@@ -26,24 +26,7 @@ def digest_of(thing: Any) -> str:
 
 
 def check_made_from(path: AnyPath, kept: Any, asked: Any, remedy: str) -> None:
-    """Check that what is kept was made from what is asked for.
-
-    Parameters
-    ----------
-    path : str or path-like
-        File or folder that is kept.
-    kept : object
-        What it was made from, in plain types, perhaps read from it.
-    asked : object
-        What is asked for: settings, or mappings and lists of them. Real numbers may differ by rounding.
-    remedy : str
-        What the user can do about a difference.
-
-    Raises
-    ------
-    FileError
-        If they differ; the message names the first difference.
-    """
+    """Check that what is kept was made from what is asked for."""
     if difference := first_difference(kept, to_plain(asked)):
         name, before, now = difference
         if _DIGEST.fullmatch(before) and _DIGEST.fullmatch(now):

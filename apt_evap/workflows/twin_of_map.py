@@ -92,7 +92,8 @@ class _Candidate:
     contrast: float = number("Sum of the amplitudes", at_least=0)
     angle_error: float = number("Standard error of the orientation", at_least=0, unit="degrees")
     pattern_radius: float = number("Radius of the tip of the pattern", above=0, unit="nm")
-    compression: float | None = number("Image compression", default=None, above=0)
+    barrel: float = number("Barrel term of the lens", default=0.0, unit="1/rad^2")
+    rim_change: float = number("Relative change of the scale from the centre to the rim", default=0.0)
 
 
 @settings
@@ -224,9 +225,12 @@ class Twin:
         try:
             return Candidate(
                 orientation=Orientation(crystal, best.axis, best.rotation),
-                projection=Projection(best.scale, best.centre, compression=best.compression),
+                projection=Projection(best.scale, best.centre, barrel=best.barrel),
                 pattern=min(patterns, key=lambda pattern: abs(pattern.apex_radius - best.pattern_radius)),
-                **{name: getattr(best, name) for name in ("score", "confidence", "rolled", "contrast", "angle_error")},
+                **{
+                    name: getattr(best, name)
+                    for name in ("score", "confidence", "rolled", "contrast", "angle_error", "rim_change")
+                },
             )
         except ValueError as error:
             raise FileError(f"{str(self.folder / FACTS)!r} is not a result of apt-evap twin: {error}") from None

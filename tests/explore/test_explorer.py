@@ -37,7 +37,7 @@ PERTURBATIONS = [
 
 @pytest.fixture(scope="module")
 def run(small_tip, made_once):
-    return made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    return made_once(small_tip, 2000, seed=1, **ROUGH)
 
 
 @pytest.fixture(scope="module")

@@ -12,9 +12,9 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
+from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.specimen_surface import surface_atoms
-from apt_evap.plot.limits import color_limits, common_limits
 
 pytest.importorskip("bokeh")
 
@@ -39,7 +39,7 @@ SECONDS = 60  # until a test gives up: the machine may be busy
 
 @pytest.fixture(scope="module")
 def run(small_tip, made_once):
-    return made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    return made_once(small_tip, 2000, seed=1, **ROUGH)
 
 
 @pytest.fixture(scope="module")
@@ -689,6 +689,9 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     opened.settle(lambda: page.maps.measured.ions is not None and page.maps.measured.ions <= copper)
     assert f"{len(page.explorer.measured):,} of 20,000 ions" in panel.told.text
     assert len(panel.ranges.data["left"]) >= 2 and "Cu⁺" in panel.labels.data["label"] and panel.figure.visible
+    panel._clicked(SimpleNamespace(x=62.93))
+    assert panel.peak.text.startswith("62.93 Da: Cu⁺") and "unexplained: " in panel.text.text
+    assert len(panel.unexplained.data["x"]) == len(panel.named.unexplained)
     box = {"type": "rect", "x0": 13.0, "x1": 15.0, "y0": 1.0, "y1": 9.0}
     panel._dragged(SimpleNamespace(geometry=box, final=True))
     opened.settle(lambda: len(page.explorer.measured) == (mass < 15).sum() and "13 to 15 Da" in panel.told.text)

@@ -52,10 +52,9 @@ class _Study:
 
 
 @pytest.fixture
-def quick(tmp_path, monkeypatch):
+def quick(tmp_path, monkeypatch, indexed_once):
     """The command with a simulation and a comparison that only write files; the calls of both are counted."""
     calls = []
-    made = {}
 
     def simulate(settings, output, **_):
         calls.append("run")
@@ -75,12 +74,8 @@ def quick(tmp_path, monkeypatch):
 
     def index(measured, material, **options):
         calls.append("index")
-        key = (measured.values.tobytes(), material, repr(options))
-        if key not in made:
-            made[key] = index_map(measured, material, **options)
-        return made[key]
+        return indexed_once(measured, material, **options)
 
-    index_map = twin_of_map.index
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(twin_of_map, "simulate", simulate)
     monkeypatch.setattr(twin_of_map, "compare", compare)
@@ -237,9 +232,9 @@ def test_the_digest_is_recorded_before_the_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path):
+def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path, indexed_once):
     ions = measurement(tmp_path / "ni.epos", voltages=(2000.0, 4000.0))
-    best = ae.index(ions, "Ni", scales=(56, 64), patterns=master_patterns("fcc")[:1]).best
+    best = indexed_once(ions, "Ni", scales=(56, 64), patterns=master_patterns("fcc")[:1]).best
     lens = ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)
     holes = ions.voltage.copy()
     holes[[100, 3000]] = 0.0, np.nan
@@ -253,6 +248,7 @@ def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path):
         assert np.isfinite(shanks[0].value) or options
 
 
+@pytest.mark.slow
 def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
     """The same folder for both, and nothing is done again; ions in memory are another measurement than their file."""
     assert main(["twin", "ni.epos", *ARGUMENTS, "--all-ions", "-o", "t"]) == 0
