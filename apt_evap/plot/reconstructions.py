@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_kind
+from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import add_colorbar, new_figure, set_title
-from apt_evap.plot.limits import color_limits
 from apt_evap.plot.map_figures import binned
 from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges
@@ -66,7 +66,7 @@ def reconstruction(
     check_kind(result, "result", Reconstruction, "a Reconstruction, the result of reconstruct")
     if len(result) < FEWEST:
         raise ValueError(f"result must have at least {FEWEST} ions for a picture, got {len(result)}")
-    names, species = _species(result, ranges)
+    names, species = species_of(result, ranges)
     figure = new_figure((11.0, 8.4))
     figure.set_layout_engine("constrained")  # not compressed: the panels stay in their columns
     axes = figure.subplots(2, 2).ravel()
@@ -86,7 +86,7 @@ def reconstruction(
     return axes
 
 
-def _species(result, ranges):
+def species_of(result, ranges):
     """Names of the groups of ions, the most frequent first, and the group of each ion."""
     if ranges is not None:
         labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(result.hits, OUTSIDE)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -192,6 +192,8 @@ class EvolvingReconstruction(Reconstruction):
     verdict: str = ""
     apex_depths: Floats | None = None
     ion_fields: Floats | None = None
+    _followed: Any = field(default=None, repr=False)  # what `again` needs
+    _cap_radii: Floats | None = field(default=None, repr=False)
 
     _has_free_projection: ClassVar[bool] = False
 
@@ -199,6 +201,42 @@ class EvolvingReconstruction(Reconstruction):
     def depths(self) -> Floats:
         """Depth of the apex of the sphere at the evaporation of each ion [nm], shape (n,)."""
         return super().depths if self.apex_depths is None else self.apex_depths
+
+    @property
+    def cap_positions(self) -> Floats:
+        """Positions of the same ions by the cap, x, y and depth [nm], shape (n, 3)."""
+        radii = self._cap_radii if self._cap_radii is not None else self.radii
+        return self.geometry.positions(self.hits, radii)
+
+    @property
+    def sequence(self) -> IonSequence:
+        """Ions of the passes in which the fields were found: every n-th of many."""
+        return self._followed[0].ions  # type: ignore[no-any-return]
+
+    def again(self, ions: IonSequence, rows: slice = slice(None)) -> Floats:
+        """Positions out of the specimen [nm] of some ions of `sequence`, perhaps changed, with the same fields.
+
+        Parameters
+        ----------
+        ions : IonSequence
+            The ions.
+        rows : slice
+            Which of those of `sequence` they are.
+
+        Returns
+        -------
+        ndarray, shape (n, 3)
+        """
+        measured, fixed = self._followed
+        surface = EvolvingSurface(ions)
+        if fixed.way == "ring":
+            return surface.integrate().positions
+        depths = measured.ions.depths[1:]
+        voltages = (measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level)[rows]
+        features = [replace(one, membership=one.membership[rows], own=one.own[rows]) for one in fixed.features]
+        first = surface.integrate(voltages, fixed.fields[rows], recession="mean")
+        outside = continued(features, first.positions, ions.in_ring)[0]
+        return surface.integrate(voltages, fixed.fields[rows], outside, "surface").positions
 
     def __repr__(self) -> str:
         fields = "".join(f"; {phase.name} {phase.ratio:.3f} ± {phase.error:.3f}" for phase in self.phases)
@@ -291,7 +329,7 @@ def follow_surface(
     fixed = _fixed_point(thinned)
     if isinstance(fixed, str):
         return _as_cap(cap, fixed + (f" ({why})" if why else ""))
-    return _placed(cap, measured, fixed, every, why)
+    return _placed(cap, measured, fixed, every, why, thinned)
 
 
 def _check_sequence(hits):
@@ -532,7 +570,7 @@ def _found_fields(measured, features, compositions, values, positions):
     return best, np.hypot(scatter, _FIELD_BIAS * np.abs(best - 1))
 
 
-def _placed(cap, measured, fixed, every, why):
+def _placed(cap, measured, fixed, every, why, thinned):
     """All ions on the surface that the fields lead to."""
     ions = measured.ions
     surface = EvolvingSurface(ions)
@@ -564,6 +602,7 @@ def _placed(cap, measured, fixed, every, why):
         positions, cap.hits, ions.radius + ions.growth * found.apex_depths, cap.settings, cap.geometry,
         history=SurfaceHistory(surface, found, means), phases=phases, continuations=tuple(fixed.ways),
         verdict=_verdict(fixed, measured, why), apex_depths=found.apex_depths, ion_fields=thresholds,
+        _followed=(thinned, fixed), _cap_radii=cap.radii,
     )  # fmt: skip
 
 

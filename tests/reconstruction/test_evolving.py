@@ -123,3 +123,37 @@ def test_true_sites_give_errors_without_a_fit_of_the_projection():
     errors = found.errors(truth, fit=("shift",))
     assert errors.lateral_rms == pytest.approx(0.0, abs=1e-9) and errors.depth_rms == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(found.errors(truth).lateral_rms, 0.0, atol=1e-9)
+
+
+def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
+    hits, _ = ions_of()
+    found = evolving(hits)
+    exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+    halves = ae.reconstruction.position_covariances(found, exact, local=(0.0, 0.0))
+    local = ae.reconstruction.position_covariances(found, exact, local=(0.2, 0.1))
+    np.testing.assert_allclose(local - halves, np.broadcast_to(np.diag([0.04, 0.04, 0.01]), halves.shape), atol=1e-12)
+    # an even flux: the halves differ by the noise of 2,000 ions, 0.1 nm
+    assert 0 < np.sqrt(halves[:, 0, 0].mean()) < 0.15
+    depth = ae.reconstruction.position_covariances(found, exact | {"efficiency": 0.1}, local=(0.0, 0.0)) - halves
+    # 10 % more efficiency: depths 1/1.1 of theirs, whose standard deviation about their mean is that of an even ramp
+    spread = found.depths[-1] / np.sqrt(12)
+    assert np.sqrt(depth[:, 2, 2].mean()) == pytest.approx(spread * (1 - 1 / 1.1), rel=0.1)
+    assert np.linalg.eigvalsh(local).min() > 0
+    across, along = ae.reconstruction.local_scatter(found, found.specimen_positions)
+    assert across == pytest.approx(0.0, abs=1e-12) and along == pytest.approx(0.0, abs=1e-12)
+    with pytest.raises(ValueError, match="constant_errors must be one of"):
+        ae.reconstruction.position_covariances(found, {"colour": 0.1})
+    with pytest.raises(ValueError, match="must have a surface that was followed, got 'cap: 50 ions"):
+        ae.reconstruction.position_covariances(evolving(ions_of(50)[0]))
+
+
+def test_the_picture_has_both_sections_and_three_fields():
+    hits, labels = ions_of(voltage=varying())
+    found = evolving(replace(hits, extra={"phase": labels}), labels=labels)
+    axes = ae.plot.surface_history(found)
+    assert [ax.get_title() for ax in axes[:2]] == ["by the cap", "by the surface"]
+    assert all(len(ax.images) == 1 for ax in axes[3:])
+    cap = ae.reconstruct(hits, radius=13.0, **KNOWN)
+    np.testing.assert_allclose(found.cap_positions, cap.positions, atol=1e-12)
+    with pytest.raises(ValueError, match="must have a surface that was followed"):
+        ae.plot.surface_history(evolving(ions_of(50)[0]))

@@ -1,0 +1,131 @@
+"""How sure the positions of an evolving reconstruction are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike
+
+from apt_evap._common.types import Floats
+from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
+from apt_evap.reconstruction.evolving import EvolvingReconstruction
+
+CONSTANT_ERRORS: Mapping[str, float] = {"compression": 0.05, "radius": 0.05, "efficiency": 0.05}
+"""Relative standard errors of the constants where none are given."""
+LOCAL_SCATTER = (0.18, 0.06)
+"""Scatter of ions about their neighbours in x and in y, and in depth [nm]: of aluminium, 12 nm, ions at rest."""
+
+_BLOCKS = 50  # of the sequence
+_CLOSE, _NEAR = 4, 24  # neighbours over which corrections of halves, and their squares, are averaged
+
+
+def position_covariances(
+    reconstruction: EvolvingReconstruction,
+    constant_errors: Mapping[str, float] | None = None,
+    local: Sequence[float] = LOCAL_SCATTER,
+) -> Floats:
+    """Covariance of the position of each ion.
+
+    Parameters
+    ----------
+    reconstruction : EvolvingReconstruction
+        A reconstruction whose surface was followed.
+    constant_errors : mapping, optional
+        Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
+    local : sequence of float
+        Scatter of the ions about their neighbours along x and y, and in depth [nm], such as `local_scatter` of a
+        simulated specimen of the same matrix.
+
+    Returns
+    -------
+    ndarray, shape (n, 3, 3)
+        Of x, y and depth [nm^2], after a common shift.
+
+    Raises
+    ------
+    ValueError
+        If the cap was used, or an error is out of range.
+
+    Notes
+    -----
+    The sum of three parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
+    neighbours; the change by one standard error of each constant; and the local scatter, which comes from the emission
+    and the lattice and is not seen in any measurement.
+    """
+    check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
+    if reconstruction.history is None:
+        raise ValueError(f"reconstruction must have a surface that was followed, got {reconstruction.verdict!r}")
+    errors = dict(CONSTANT_ERRORS)
+    for name, value in (constant_errors or {}).items():
+        check_choice(name, "constant_errors", tuple(CONSTANT_ERRORS))
+        errors[name] = check_number(value, f"constant_errors[{name!r}]", at_least=0, below=0.5)
+    across, along = (check_number(value, "local", at_least=0, unit="nm") for value in check_array(local, "local", (2,)))
+    ions = reconstruction.sequence
+    usual = reconstruction.again(ions)
+    sphere = ions.radius * ions.directions - np.array([0, 0, 1]) * ions.depths[1:, None]
+    total = np.zeros((len(usual), 3, 3))
+    total[:, [0, 1, 2], [0, 1, 2]] = across**2, across**2, along**2
+    corrections = []
+    for first in (0, 1):
+        rows = slice(first, None, 2)
+        # all ions of a half on the sphere, and by how much the surface moves them
+        moved = reconstruction.again(ions.part(first, 2), rows) - sphere[rows]
+        near = scipy.spatial.cKDTree(sphere[rows]).query(sphere, k=_CLOSE)[1]
+        corrections.append(moved[near].mean(axis=1))
+    half = (corrections[0] - corrections[1]) / 2
+    half -= half.mean(axis=0)
+    near = scipy.spatial.cKDTree(sphere).query(sphere, k=_NEAR)[1]
+    products = half[:, :, None] * half[:, None, :]
+    total += products[near].mean(axis=1)
+    for name, error in errors.items():
+        change = reconstruction.again(_changed(reconstruction, name, 1 + error)) - usual if error else 0 * usual
+        change -= change.mean(axis=0)
+        total += change[:, :, None] * change[:, None, :]
+    total *= np.array([1, 1, -1])[:, None] * np.array([1, 1, -1])  # depth in place of z
+    if len(usual) == len(reconstruction):
+        return total
+    places = reconstruction.positions
+    stride = -(-len(places) // len(usual))
+    return np.asarray(total[scipy.spatial.cKDTree(places[::stride]).query(places)[1]])
+
+
+def local_scatter(reconstruction: EvolvingReconstruction, sites: ArrayLike) -> tuple[float, float]:
+    """Scatter of the errors of ions about the mean error of those that left at about the same time.
+
+    Parameters
+    ----------
+    reconstruction : EvolvingReconstruction
+        Reconstruction of a simulated specimen, such as the pure matrix of a measured one.
+    sites : array_like
+        True sites of its ions [nm], shape (n, 3), with z out of the specimen.
+
+    Returns
+    -------
+    tuple of float
+        Standard deviation along x and y, and in depth [nm], for `position_covariances`.
+    """
+    check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
+    true = check_array(sites, "sites", (len(reconstruction), 3))
+    errors = reconstruction.specimen_positions - true
+    # the mean of a block is an error of the recession, which the constants and the halves account for
+    blocks = np.array_split(errors, _BLOCKS)
+    squares = np.concatenate([(block - block.mean(axis=0)) ** 2 for block in blocks if len(block)]).mean(axis=0)
+    return float(np.sqrt(squares[:2].mean())), float(np.sqrt(squares[2]))
+
+
+def _changed(reconstruction, name, factor):
+    """The ions with one constant times a factor."""
+    ions = reconstruction.sequence
+    if name == "radius":
+        return replace(ions, radius=ions.radius * factor)
+    if name == "efficiency":
+        return replace(ions, volume=ions.volume / factor)
+    every = -(-len(reconstruction) // len(ions.directions))
+    hits, radii = reconstruction.hits[::every], reconstruction.radii[::every]
+    geometry = replace(reconstruction.geometry, compression=reconstruction.geometry.compression * factor)
+    places, angles = geometry.places(hits, radii)
+    rim = float(np.mean(geometry.rim_angles(hits, radii)))
+    return replace(ions, directions=np.column_stack([places, np.cos(angles)]), rim=rim)
