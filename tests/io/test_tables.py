@@ -47,7 +47,8 @@ def test_a_csv_is_read_back(tmp_path, dtype):
         x=values[0].astype(dtype), y=values[1].astype(dtype), time_of_flight=values[2].astype(dtype),
         voltage=values[3].astype(dtype), mass_to_charge=values[4].astype(dtype),
         positions=random.normal(size=(60, 3)).astype(dtype), pulse_id=np.arange(60) // 2,
-        multiplicity=np.full(60, 2), extra={"element": np.array(["Al", 'C"u'] * 30), "pair": random.normal(size=(60, 2))},
+        multiplicity=np.full(60, 2),
+        extra={"element": np.array(["Al", 'C"u'] * 30), "pair": random.normal(size=(60, 2))},
         units={"pair": "nm"},
     )  # fmt: skip
     write(tmp_path / "a.csv", hits)
@@ -129,3 +130,9 @@ def test_nxapm_with_lzf_and_masses_in_a_column(tmp_path):
         np.testing.assert_array_equal(read(nxapm(tmp_path / f"{name}.nxs", values, **options)).mass_to_charge, mass)
     with pytest.raises(FileError, match=r"must have shape \(any\), got \(150, 2\)"):
         read(nxapm(tmp_path / "two.nxs", mass.reshape(150, 2)))
+
+
+def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "a.csv").write_text("x [mm],y [mm]\n1,2\n")
+    assert read("~/a.csv").x.tolist() == [1.0]
