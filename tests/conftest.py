@@ -1,7 +1,10 @@
-"""Small specimens, made once for all tests, and runs, made once for all processes that test."""
+"""Small specimens, made once for all tests, and runs, made once for all tests until what computes them changes."""
 
 import gc
+import hashlib
 import os
+import pickle
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -21,7 +24,12 @@ sys.path.append(str(Path(__file__).parent))  # for twins.py, whatever the import
 from rough import ROUGH
 
 import apt_evap as ae
+from apt_evap._common.codec import to_plain
+from apt_evap._common.files import replace_file
 from apt_evap._common.locks import FileLock
+from apt_evap.maps.indexing.master_pattern import master_patterns
+
+PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -53,24 +61,84 @@ def read_only(thing):
     return thing
 
 
-@pytest.fixture(scope="session")
-def made_once(tmp_path_factory):
-    """Function of a name and of a function that makes a run: one process makes and saves it, all load it."""
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent  # of all workers
+def hash_of(*parts):
+    """Hash of bytes."""
+    hashed = hashlib.sha256()
+    for part in parts:
+        hashed.update(hashlib.sha256(part).digest())
+    return hashed.hexdigest()[:24]
 
-    def load(name, make):
-        path = folder / f"{name}.h5"
-        lock = FileLock(path.with_suffix(".lock"), name, wait=lambda: None)
+
+def kept_folder(config, tmp_path_factory, name, packages):
+    """Folder of what these packages compute: it outlives the tests, and goes when their code has changed."""
+    if not hasattr(config, "cache"):  # without the plugin of pytest
+        return tmp_path_factory.mktemp(name)
+    package = Path(ae.__file__).parent
+    paths = [path for part in packages for path in sorted((package / part).rglob("*")) if path.is_file()]
+    sources = [path.read_bytes() for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
+    folder = config.cache.mkdir(name) / hash_of(*sources)
+    folder.mkdir(exist_ok=True)
+    for other in folder.parent.iterdir():
+        if other != folder:
+            shutil.rmtree(other, ignore_errors=True)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def kept_runs(pytestconfig, tmp_path_factory):
+    """Folder of the runs of this core."""
+    return kept_folder(pytestconfig, tmp_path_factory, "runs", PACKAGES_OF_RUNS)
+
+
+@pytest.fixture(scope="session")
+def indexed_once(pytestconfig, tmp_path_factory):
+    """`ae.index`, computed by the first test that needs it."""
+    packages = ("_common", "_core", "specimen", "detection", "maps")
+    folder = kept_folder(pytestconfig, tmp_path_factory, "indexings", packages)
+
+    def indexed(measured, material, **options):
+        key = hash_of(pickle.dumps((measured, material, sorted(options.items()))))
+        path = folder / f"{key}.pickle"
+        lock = FileLock(path.with_suffix(".lock"), key, wait=lambda: None)
         try:
             if not path.exists():
-                make().save(path)
+                indexing = ae.index(measured, material, **options)
+                with replace_file(path) as file:
+                    pickle.dump(indexing, file)
+        finally:
+            lock.release()
+        return pickle.loads(path.read_bytes())
+
+    return indexed
+
+
+@pytest.fixture(scope="session")
+def indexed_nickel(indexed_once):
+    """Orientation of nickel, a map of it at a scale of 60 mm/rad, and what `ae.index` says of this map."""
+    truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
+    pattern = master_patterns("fcc")[0]
+    measured = pattern.map(truth, ae.detection.Projection(60.0), 70.0, ions=30_000, rolled=0.5, seed=1)
+    return truth, indexed_once(measured, "Ni", scales=(54, 66), patterns=[pattern])
+
+
+@pytest.fixture(scope="session")
+def made_once(kept_runs):
+    """`Simulation(tip, **options).run(ions, emissions, responses)`, by the first test that needs this run."""
+
+    def made(tip, ions, emissions=(), responses=True, **options):
+        plain = {name: to_plain(value) for name, value in options.items() if name != "n_threads"}
+        key = hash_of(repr((tip.settings, ions, to_plain(emissions), responses, sorted(plain.items()))).encode())
+        path = kept_runs / f"{key}.h5"
+        lock = FileLock(path.with_suffix(".lock"), key, wait=lambda: None)
+        try:
+            if not path.exists():
+                simulation = ae.Simulation(tip, **options)
+                simulation.run(ions, emissions, responses=responses, progress=False).save(path)
         finally:
             lock.release()
         return read_only(ae.load(path))
 
-    return load
+    return made
 
 
 @pytest.fixture(scope="session")
@@ -115,12 +183,7 @@ def run20(tip20, made_once):
     """15,000 ions of `tip20`, each flown at rest and rolled up, with responses."""
     detector = ae.Detector(distance=100.0, width=300.0)
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
-
-    def make():
-        simulation = ae.Simulation(tip20, voltage=1000.0, seed=1, detector=detector, **ROUGH)
-        return simulation.run(15_000, flown, progress=False)
-
-    return made_once("run20", make)
+    return made_once(tip20, 15_000, flown, voltage=1000.0, seed=1, detector=detector, **ROUGH)
 
 
 @pytest.fixture

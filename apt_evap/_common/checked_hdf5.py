@@ -66,29 +66,7 @@ class _Sink:
 
 @contextmanager
 def write_hdf5(path: AnyPath, kind: str, rows: int, note: str = "") -> Iterator[h5py.File]:
-    """Write an HDF5 file with checksums, which is either complete or absent.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write or overwrite.
-    kind : str
-        Kind of content, for `label_of`.
-    rows : int
-        Number of its rows.
-    note : str
-        What else `label_of` should tell, in some hundred characters.
-
-    Yields
-    ------
-    h5py.File
-        For `put_field` and `put_text`.
-
-    Raises
-    ------
-    FileError
-        If it cannot be written.
-    """
+    """Write an HDF5 file with checksums, which is either complete or absent."""
     with replace_file(path) as target:
         sink = _Sink(target)
         try:
@@ -104,25 +82,7 @@ def write_hdf5(path: AnyPath, kind: str, rows: int, note: str = "") -> Iterator[
 
 
 def put_field(group: Any, name: str, values: Any, units: str | None = None, *, compress: bool = False) -> Any:
-    """Write numbers or texts as a dataset, with their unit.
-
-    Parameters
-    ----------
-    group : h5py.Group
-        Where to write.
-    name : str
-        Name of the dataset.
-    values : array_like
-        Its content. Only arrays have checksums; others are not read again.
-    units : str, optional
-        Unit of numbers.
-    compress : bool
-        Whether to compress. A chunk then contains one number of many rows, whose bytes are alike.
-
-    Returns
-    -------
-    h5py.Dataset
-    """
+    """Write numbers or texts as a dataset, with their unit."""
     values = np.asarray(values)
     if values.ndim and values.dtype.kind in "OU":
         values = np.char.encode(values.astype(str), "utf-8")
@@ -150,25 +110,7 @@ def put_text(group: Any, name: str, text: str) -> None:
 
 @contextmanager
 def open_hdf5(path: AnyPath, what: str = "HDF5") -> "Iterator[CheckedFile]":
-    """Open an HDF5 file, also one of another program, which may have no checksums.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    what : str
-        Expected content, for messages.
-
-    Yields
-    ------
-    CheckedFile
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, damaged or not HDF5, or if its content is not as expected: errors in the
-        block become one sentence.
-    """
+    """Open an HDF5 file, also one of another program, which may have no checksums."""
     name = str(check_path(path))
     with open_for_reading(path) as raw, io.BufferedReader(raw) as file:  # type: ignore[type-var]
         size = file.seek(0, io.SEEK_END)
@@ -200,13 +142,7 @@ def _first_line(error):
 
 
 def label_of(path: AnyPath) -> Label | None:
-    """Kind, rows and note of a file of `write_hdf5`; None for an HDF5 file of another program.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, damaged or not HDF5.
-    """
+    """Kind, rows and note of a file of `write_hdf5`; None for an HDF5 file of another program."""
     with open_hdf5(path) as file:
         return file.label
 
@@ -216,10 +152,6 @@ class CheckedFile:
 
     Parameters
     ----------
-    file : h5py.File
-        Open for reading.
-    name : str
-        Its name.
     size : int
         Its size [bytes].
     """
@@ -272,27 +204,8 @@ class CheckedFile:
 
         Parameters
         ----------
-        path : str
-            Name of the dataset, with the names of its groups.
-        dtype : dtype or None
-            Expected type; None for any numbers and texts of fixed length.
         shape : tuple or None
             Expected shape; None for any length, or for any shape.
-        rows : slice
-            Rows to read.
-        compressed : bool
-            Read data that are compressed by deflate, as other programs write them.
-
-        Returns
-        -------
-        ndarray
-
-        Raises
-        ------
-        KeyError, ValueError
-            If it is missing or not as expected.
-        FileError
-            If it is damaged.
         """
         item = self._item(path)
         if not isinstance(item, h5py.Dataset):

@@ -4,39 +4,13 @@ import math
 
 
 def decimals_for(error: float) -> int:
-    """Decimal places for a number with an error; negative ones are tens and hundreds.
-
-    Parameters
-    ----------
-    error : float
-        Standard error, or half of an interval.
-
-    Returns
-    -------
-    int
-        So that the error has two digits if they are at most 35, else one: rounding changes the number by less than a
-        seventh of its error.
-    """
+    """Decimal places for a number with an error; negative ones are tens and hundreds."""
     power = math.floor(math.log10(error))
     return (1 if error < 3.55 * 10.0**power else 0) - power
 
 
 def rounded_text(value: float, error: float, digits: int = 3) -> str:
-    """Number with the digits that an error allows, or with some digits if the error is not known.
-
-    Parameters
-    ----------
-    value : float
-        The number.
-    error : float
-        Standard error, or half of an interval; 0 or NaN if it is not known.
-    digits : int
-        Digits without an error.
-
-    Returns
-    -------
-    str
-    """
+    """Number with the digits that an error allows, or with some digits if the error is not known."""
     if not (math.isfinite(error) and error > 0 and math.isfinite(value)):
         if not 1 <= abs(value) < 1e6:
             return f"{value:.{digits}g}"

@@ -38,13 +38,7 @@ class TruncatedFile(FileError):
 
 
 def check_path(path: Any) -> Path:
-    """Return `path` as a Path.
-
-    Raises
-    ------
-    FileError
-        If it is not a str or a path, or contains a character that names of files cannot have, here or in this locale.
-    """
+    """Return `path` as a Path."""
     if not isinstance(path, str | os.PathLike) or "\0" in os.fspath(path):
         raise FileError(f"path must be a file name, got {path!r:.80}")
     try:
@@ -59,23 +53,7 @@ def check_path(path: Any) -> Path:
 
 @contextmanager
 def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
-    """Open a file for reading bytes.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
-    Yields
-    ------
-    file
-        Open for reading bytes, unbuffered.
-
-    Raises
-    ------
-    FileError
-        If it is missing, unreadable or not a regular file. Reading from a pipe could block forever.
-    """
+    """Open a file for reading bytes."""
     path = check_path(path)
     try:
         with open(path, "rb", buffering=0, opener=open_regular) as file:
@@ -89,21 +67,8 @@ def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     at_most : int
         Largest allowed size [bytes].
-    what : str
-        Expected content, for the message.
-
-    Returns
-    -------
-    bytes
-
-    Raises
-    ------
-    FileError
-        If it is larger, or cannot be read.
     """
     parts, size = [], 0
     with open_for_reading(path) as file:
@@ -126,21 +91,6 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
     """Write a file under a temporary name in the same folder, and rename it when it is complete.
 
     A file that is overwritten keeps its mode. What killed processes left of the same file is removed after an hour.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file to write or overwrite.
-
-    Yields
-    ------
-    file
-        Open for writing and reading bytes.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written, or is not a regular file. The temporary file is then removed.
     """
     path = check_path(path)
     part = None

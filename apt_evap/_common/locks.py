@@ -31,20 +31,7 @@ def open_lock(path: AnyPath, flags: int = os.O_RDWR | os.O_CREAT) -> int:
 
 
 def try_lock(descriptor: int, shared: bool = False) -> bool:
-    """Lock an open file until it is closed; return whether it was free.
-
-    Parameters
-    ----------
-    descriptor : int
-        Of the open file.
-    shared : bool
-        Whether others may have shared locks of it at the same time; Windows has no such locks.
-
-    Raises
-    ------
-    OSError
-        If the file system has no locks.
-    """
+    """Lock an open file until it is closed; return whether it was free."""
     try:
         if fcntl is None:
             os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
@@ -59,22 +46,7 @@ def try_lock(descriptor: int, shared: bool = False) -> bool:
 
 
 class FileLock:
-    """A locked file beside another one. It is removed by `release`, and remains unlocked if this process is killed.
-
-    Parameters
-    ----------
-    path : Path
-        The lock file.
-    of : str
-        Name of what it protects, for messages.
-    wait : callable, optional
-        Called once if another process has locked it, to wait for its end; by default that is an error.
-
-    Raises
-    ------
-    FileError
-        If another process has locked it, or if it cannot be written.
-    """
+    """A locked file beside another one. It is removed by `release`, and remains unlocked if this process is killed."""
 
     def __init__(self, path: Path, of: str, wait: Callable[[], object] | None = None) -> None:
         self._path, self._of = path, of

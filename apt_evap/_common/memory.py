@@ -28,18 +28,7 @@ def copied_memory(surface_atoms: float, n_threads: int) -> float:
 
 
 def check_memory(atoms: float, surface_atoms: float) -> None:
-    """Check that a specimen and its charges fit into the free memory.
-
-    Parameters
-    ----------
-    atoms, surface_atoms : float
-        Approximate number of atoms, and of surface atoms among them.
-
-    Raises
-    ------
-    ValueError
-        If they do not fit; the message names the needed and the free memory.
-    """
+    """Check that a specimen and its charges fit into the free memory."""
     _check(
         needed_memory(atoms, surface_atoms),
         f"a tip of {atoms:.2g} atoms",

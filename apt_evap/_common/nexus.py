@@ -54,8 +54,6 @@ def put_nxapm(
 
     Parameters
     ----------
-    file : h5py.File
-        Open for writing.
     ions : array_like of int64
         Number of each ion in the sequence of evaporation, shape (n,).
     hits : array_like or None
@@ -66,14 +64,6 @@ def put_nxapm(
         Mass-to-charge ratios [Da], shape (n,).
     multiplicity : array_like of uint32, optional
         Number of ions in the pulse of each ion, shape (n,).
-    elements : sequence of str
-        Names of the elements of the specimen.
-    start_time : str
-        Time in ISO 8601 with its offset.
-    version : str
-        Version of this package.
-    is_simulation : bool
-        Whether the ions were simulated.
     radius : float, optional
         Initial radius of the specimen [nm].
     shank_angle : float, optional
@@ -115,13 +105,6 @@ def put_links(file: h5py.File, columns: Mapping[str, Any]) -> None:
 
     NXapm allows these groups only with data that are not recorded here, such as the pressure. They are therefore of the
     class NXcollection.
-
-    Parameters
-    ----------
-    file : h5py.File
-        Open for writing.
-    columns : mapping
-        Datasets by path, such as `POSITIONS`.
     """
     for path, dataset in columns.items():
         *folders, name = path.split("/")

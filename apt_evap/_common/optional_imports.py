@@ -5,24 +5,7 @@ from typing import Any
 
 
 def optional_import(name: str, what: str) -> Any:
-    """Import an optional package.
-
-    Parameters
-    ----------
-    name : str
-        Name of the module.
-    what : str
-        Name of the feature that needs it, for the message.
-
-    Returns
-    -------
-    module
-
-    Raises
-    ------
-    ImportError
-        If it is not installed.
-    """
+    """Import an optional package."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -16,11 +16,6 @@ def die_with(parent: int) -> None:
     """End this process when its parent ends, also if the parent is killed.
 
     Without it, a computation would outlive its killed parent and write on while another process repeats it.
-
-    Parameters
-    ----------
-    parent : int
-        Process number of the parent; if it has already ended, this process ends at once.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

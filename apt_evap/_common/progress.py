@@ -5,17 +5,7 @@ from typing import Any
 
 
 def progress_bar(**options: Any) -> Any:
-    """Return a progress bar of tqdm, which is imported at the first call.
-
-    Parameters
-    ----------
-    **options
-        Arguments of `tqdm.tqdm`.
-
-    Returns
-    -------
-    tqdm.tqdm
-    """
+    """Return a progress bar of tqdm, which is imported at the first call."""
     from tqdm import TqdmWarning
 
     with warnings.catch_warnings():

@@ -32,22 +32,7 @@ def usable_threads(n_threads: int) -> int:
 
 
 def thread_count(n_threads: int | None = None) -> int:
-    """Return the number of threads to use.
-
-    Parameters
-    ----------
-    n_threads : int, optional
-        Number requested by the user; by default the number of processors that this process may use.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ValueError
-        If it is not an integer >= 1.
-    """
+    """Return the number of threads to use."""
     if n_threads is not None:
         n_threads = check_count(n_threads, "n_threads", at_least=1)
         if n_threads > MAX_THREADS:

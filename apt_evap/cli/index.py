@@ -40,9 +40,12 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
     indexing = indexed(measured_of(options), options)
     tell(options, f"{indexing}")
-    save_figure(picture, plot.indexing(indexing)[0].figure)
-    tell(options, f"wrote {picture}")
-    tell_json(options, {"wrote": str(picture), "file": options.file, **indexing.to_dict()})
+    written = {}
+    if indexing.candidates:  # of a map that can show no orientation there is no picture
+        save_figure(picture, plot.indexing(indexing)[0].figure)
+        tell(options, f"wrote {picture}")
+        written = {"wrote": str(picture)}
+    tell_json(options, {**written, "file": options.file, **indexing.to_dict()})
     return 0
 
 

@@ -1,6 +1,8 @@
 """Entry point of `apt-evap`: signals, warnings, errors and exit codes."""
 
+import contextlib
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -41,9 +43,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             code = _execute(arguments)
             flush()
+            if code == INTERRUPTED:
+                _say_how_to_go_on(arguments)
             return TERMINATED if terminated and code == INTERRUPTED else code
         except KeyboardInterrupt:
-            print("apt-evap: interrupted", file=sys.stderr)
+            _say_how_to_go_on(arguments)
             return TERMINATED if terminated else INTERRUPTED
         except BrokenPipeError:  # the reader of the output has closed the pipe
             discard_stdout()
@@ -66,6 +70,21 @@ def _say_warning(message, category, *_, **__):
     from apt_evap.warnings import WorkflowWarning
 
     say("note" if issubclass(category, WorkflowWarning) else "warning", message)
+
+
+_KEEPING = ("run", "sweep", "dataset", "twin", "paper")  # commands that go on from what they have done
+
+
+def _say_how_to_go_on(arguments):
+    """Print what an interrupted command has left, and the command that goes on."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    command = next((word for word in words if not word.startswith("-")), "")
+    if command == "run":  # --force would begin anew
+        words = [word for word in words if word not in ("--force", "--resume")] + ["--resume"]
+    kept, what = ("what is done is kept", "go on") if command in _KEEPING else ("nothing is kept", "start again")
+    line = f"interrupted, {kept}; to {what}: {shlex.join(['apt-evap', *words])}"
+    with contextlib.suppress(OSError):  # stderr is closed
+        print(f"apt-evap: {line}", file=sys.stderr)
 
 
 def _execute(arguments):
@@ -116,3 +135,7 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
         yield signals
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+if __name__ == "__main__":  # python -m apt_evap.cli.main, as python -m apt_evap.cli
+    sys.exit(main())

@@ -15,7 +15,7 @@ exit codes:
   0    success; names of written files on stdout, warnings on stderr
   1    the reader of the output has closed the pipe
   2    error, explained in one sentence on stderr; no incomplete file remains
-  130  interrupted by Ctrl-C; `run` has saved the ions so far
+  130  interrupted by Ctrl-C; what is kept, and the command that goes on, are on stderr
   143  the same by SIGTERM, as sent by batch systems
 """
 """Meaning of the exit codes, for the help."""

@@ -6,6 +6,8 @@ A projection gives the distance r from the centre of the detector, divided by it
 plane                  tan(theta)          straight flights onto a plane detector, ``compression`` 1
 compressed             xi tan(theta / xi)  the same with the image compression xi
 azimuthal equidistant  theta               ``compression`` None, the limit of a large xi
+with a lens            theta (1 - b        ``barrel`` b: positive if the lens compresses the rim,
+                       theta^2)            negative if it stretches the rim (pincushion)
 =====================  ==================  =======================================================
 
 The directions at the end of flights are stereographic, s = tan(theta / 2) (cos, sin)(azimuth). They stay smooth and
@@ -62,13 +64,25 @@ def along_axis(lengths: Floats, s2: Floats) -> Floats:
     return lengths * (1.0 - s2) / (1.0 + s2)
 
 
-def radius_of(angle: Floats, compression: float | None) -> Floats:
+def radius_of(angle: Floats, compression: float | None, barrel: float = 0.0) -> Floats:
     """Distances from the centre divided by the scale for polar angles [rad], of the same shape."""
+    if barrel:
+        return angle * (1.0 - barrel * angle * angle)
     return angle if compression is None else compression * np.tan(angle / compression)
 
 
-def angle_of(radius: Floats, compression: float | None) -> Floats:
-    """Polar angles [rad] for distances from the centre divided by the scale, of the same shape."""
+def angle_of(radius: Floats, compression: float | None, barrel: float = 0.0) -> Floats:
+    """Polar angles [rad] for distances from the centre divided by the scale, of the same shape.
+
+    With a barrel term b they are the root of angle (1 - b angle^2) = radius next to 0 (Cardano's formulas); for
+    distances that no angle reaches, the angle of the largest distance.
+    """
+    if barrel:
+        root = math.sqrt(3 * abs(barrel))
+        triple = 1.5 * root * radius
+        if barrel > 0:
+            return (2 / root) * np.sin(np.arcsin(np.minimum(triple, 1.0)) / 3)
+        return (2 / root) * np.sinh(np.arcsinh(triple) / 3)
     return radius if compression is None else compression * np.arctan(radius / compression)
 
 
@@ -87,16 +101,21 @@ class Projection:
     compression : float, optional
         None for the azimuthal equidistant projection. A number is the image compression xi onto a plane detector: the
         angle in the specimen divided by the angle of the straight flight.
+    barrel : float
+        Term b of a lens [1/rad^2], without a compression: the rim at the angle theta is nearer to the centre by the
+        fraction b theta^2.
 
     Raises
     ------
     ValueError
-        If the scale or the compression is not positive, or the centre is not a position.
+        If the scale or the compression is not positive, the centre is not a position, or a compression and a barrel
+        term are both given.
 
     Notes
     -----
     With the polar angle theta from the axis and the image compression xi, the distance from the centre is
-    r = scale theta, or r = scale xi tan(theta / xi). Measured maps are closer to the first (De Geuser and Gault,
+    r = scale theta, or r = scale xi tan(theta / xi); with a barrel term, r = scale theta (1 - b theta^2), the first two
+    terms of any lens that is symmetric about its axis. Measured maps are closer to the first (De Geuser and Gault,
     Microsc. Microanal. 23, 238 (2017)); simulated ions on a plane are described by the second (`image_compression`).
     """
 
@@ -104,6 +123,7 @@ class Projection:
     centre: tuple = (0.0, 0.0)
     mirror: bool = False
     compression: float | None = None
+    barrel: float = 0.0
 
     def __post_init__(self):
         object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0, unit="mm/rad"))
@@ -112,6 +132,9 @@ class Projection:
         if self.compression is not None:
             compression = check_number(self.compression, "compression", above=0)
             object.__setattr__(self, "compression", compression)
+        object.__setattr__(self, "barrel", check_number(self.barrel, "barrel", unit="1/rad^2"))
+        if self.barrel and self.compression is not None:
+            raise ValueError(f"give compression or barrel, not both, got {self.compression:g} and {self.barrel:g}")
 
     def places(self, directions: ArrayLike) -> Floats:
         """Positions of directions on the detector.
@@ -130,7 +153,7 @@ class Projection:
         x, y, _ = directions.T
         across, angle = np.hypot(x, y), polar_angles(directions)
         ahead = angle < self.last_angle
-        radius = self.scale * radius_of(np.where(ahead, angle, 0.0), self.compression)
+        radius = self.scale * radius_of(np.where(ahead, angle, 0.0), self.compression, self.barrel)
         stretch = np.divide(radius, across, out=np.zeros_like(radius), where=across > 0)
         stretch[~ahead] = np.nan
         return np.column_stack([-x if self.mirror else x, y]) * stretch[:, None] + self.centre
@@ -150,18 +173,20 @@ class Projection:
         """
         x, y = (check_array(places, "places", ("n", 2)) - self.centre).T
         radius = np.hypot(x, y)
-        angle = angle_of(radius / self.scale, self.compression)
+        angle = angle_of(radius / self.scale, self.compression, self.barrel)
         stretch = np.divide(np.sin(angle), radius, out=np.full_like(radius, 1 / self.scale), where=radius > 0)
         return np.column_stack([(-x if self.mirror else x) * stretch, y * stretch, np.cos(angle)])
 
     def angles(self, places: ArrayLike) -> Floats:
         """Polar angles [rad], shape (n,), of the directions at positions x and y [mm], shape (n, 2)."""
         x, y = (check_array(places, "places", ("n", 2), finite=False) - self.centre).T
-        return angle_of(np.hypot(x, y) / self.scale, self.compression)
+        return angle_of(np.hypot(x, y) / self.scale, self.compression, self.barrel)
 
     @property
     def last_angle(self) -> float:
-        """Polar angle above which a direction points away from the detector [rad]."""
+        """Polar angle above which a direction points away from the detector, or a barrel folds the image [rad]."""
+        if self.barrel > 0:
+            return min(math.pi / 2, 1 / math.sqrt(3 * self.barrel))
         return math.pi / 2 if self.compression is None else min(1.0, self.compression) * math.pi / 2
 
     @property
@@ -169,10 +194,16 @@ class Projection:
         """Distance from the centre for the last angle [mm]; infinite for a compression <= 1."""
         if self.compression is not None and self.compression <= 1:
             return math.inf
-        return self.scale * float(radius_of(np.array(self.last_angle), self.compression))
+        return self.scale * float(radius_of(np.array(self.last_angle), self.compression, self.barrel))
 
     def compressed(self, compression: float) -> Projection:
         """Projection for polar angles in the specimen that are `compression` times the angles of this projection."""
         compression = check_number(compression, "compression", above=0)
         product = None if self.compression is None else self.compression * compression
-        return replace(self, scale=self.scale / compression, compression=product)
+        barrel = self.barrel / compression**2
+        return replace(self, scale=self.scale / compression, compression=product, barrel=barrel)
+
+    def change_of_scale(self, radius: float) -> float:
+        """Relative change of the distance per angle from the centre to a radius [mm]: negative for a barrel."""
+        angle = float(angle_of(np.array(radius / self.scale), self.compression, self.barrel))
+        return radius / (self.scale * angle) - 1

@@ -20,15 +20,7 @@ _MINUTES = 1.0  # between checkpoints
 
 
 class BackgroundRun:
-    """A run as of ``apt-evap run SETTINGS -o OUTPUT --resume``; it starts at once.
-
-    Parameters
-    ----------
-    settings : Path
-        Settings file.
-    output : Path
-        File of the run. An unfinished run with these settings is continued, any other file is left as it is.
-    """
+    """A run as of ``apt-evap run SETTINGS -o OUTPUT --resume``; it starts at once."""
 
     def __init__(self, settings: Path, output: Path) -> None:
         self.settings, self.output = settings, output

@@ -15,17 +15,7 @@ _NO_COMMAND = "(no command for this rectangle: the measured map has no ions)"
 
 
 class CodePanel:
-    """Texts and the buttons that copy them.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Writes the texts.
-    maps : ExplorerMaps
-        Maps at the start.
-    figures : sequence of bokeh.plotting.figure
-        The maps, on which rectangles are drawn.
-    """
+    """Texts and the buttons that copy them."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, figures: Sequence[Any]) -> None:
         self._explorer, self._maps = explorer, maps

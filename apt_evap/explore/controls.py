@@ -15,19 +15,7 @@ MECHANISMS = {"unperturbed": Unperturbed, "lateral": LateralVelocity, "roll-up":
 
 @dataclass(frozen=True)
 class Control:
-    """Slider for one number of a perturbation.
-
-    Parameters
-    ----------
-    name : str
-        Field of the perturbation, or one of `ENERGY`.
-    title : str
-        Title with unit.
-    low, high, step : float
-        Range and step.
-    value : float
-        Value at the start.
-    """
+    """Slider for one number of a perturbation."""
 
     name: str
     title: str
@@ -58,22 +46,7 @@ _DIGITS = 9  # of a standard deviation: removes the rounding of the product, far
 
 
 def controls_of(mechanism: str) -> tuple[Control, ...]:
-    """Controls of a mechanism.
-
-    Parameters
-    ----------
-    mechanism : str
-        One of `MECHANISMS`.
-
-    Returns
-    -------
-    tuple of Control
-
-    Raises
-    ------
-    ValueError
-        If the mechanism is unknown.
-    """
+    """Controls of a mechanism."""
     kind: Any = MECHANISMS[check_choice(mechanism, "mechanism", MECHANISMS)]
     names = {field.name for field in fields(kind)}
     if mechanism == "combined":
@@ -84,26 +57,7 @@ def controls_of(mechanism: str) -> tuple[Control, ...]:
 
 
 def perturbation_of(mechanism: str, values: Mapping[str, float]) -> Perturbation:
-    """Perturbation of a mechanism for the values of its controls.
-
-    Parameters
-    ----------
-    mechanism : str
-        One of `MECHANISMS`.
-    values : mapping of str to float
-        Value of each control by name; others are ignored.
-
-    Returns
-    -------
-    perturbation
-        With equal energies for a relative standard deviation or a mean of 0, otherwise with a truncated normal
-        distribution.
-
-    Raises
-    ------
-    ValueError
-        If the mechanism is unknown, or a value is missing or outside its range.
-    """
+    """Perturbation of a mechanism for the values of its controls."""
     names = [control.name for control in controls_of(mechanism)]
     for name in names:
         if name not in values:
@@ -122,23 +76,7 @@ def _distribution(mean, relative_spread):
 
 
 def values_of(perturbation: Perturbation) -> tuple[str, dict[str, float]]:
-    """Mechanism of a perturbation, and the values of its controls.
-
-    Parameters
-    ----------
-    perturbation : perturbation
-        One of `MECHANISMS`, with a number or `TruncatedNormal` as energy, and numbers as options.
-
-    Returns
-    -------
-    mechanism : str
-    values : dict of str to float
-
-    Raises
-    ------
-    ValueError
-        If the perturbation has no controls.
-    """
+    """Mechanism of a perturbation, and the values of its controls."""
     kinds = {kind: mechanism for mechanism, kind in MECHANISMS.items()}
     if type(perturbation) not in kinds:
         names = ", ".join(kind.__name__ for kind in kinds)

@@ -13,17 +13,7 @@ _MOST_BINS = 512
 
 
 class DisplayPanel:
-    """Sliders of the bins and of the Gaussians.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        A measured map limits the bins.
-    maps : ExplorerMaps
-        Maps at the start; their settings are those after a reset.
-    request : callable
-        As for `request_maps_of`.
-    """
+    """Sliders of the bins and of the Gaussians."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, request: Callable[[bool], None]) -> None:
         self._first, self._request = maps.settings, request

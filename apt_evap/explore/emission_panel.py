@@ -14,17 +14,7 @@ _FURTHER = ("sharpness", "height", "others")  # sliders that few move
 
 
 class EmissionPanel:
-    """Widgets of the emission.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Says which controls the run permits.
-    perturbation : perturbation
-        Emission at the start, and after a reset.
-    request : callable
-        As for `request_maps_of`.
-    """
+    """Widgets of the emission."""
 
     def __init__(self, explorer: Explorer, perturbation: Perturbation, request: Callable[[bool], None]) -> None:
         self._explorer, self._first, self._request = explorer, perturbation, request

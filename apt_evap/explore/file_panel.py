@@ -15,20 +15,7 @@ _MOST_FILES = 300  # that are proposed
 
 
 class FilePanel:
-    """Field for the path of a file.
-
-    Parameters
-    ----------
-    read : callable or None
-        Reads a file, from its path, in any thread; the function that it returns makes the page again. None if no file
-        can be opened: the field is then hidden.
-    close : callable
-        Closes the page.
-    note : callable
-        Shows a sentence.
-    later : callable
-        As for `Page`.
-    """
+    """Field for the path of a file."""
 
     def __init__(
         self,

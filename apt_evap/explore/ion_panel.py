@@ -9,17 +9,7 @@ from apt_evap.explore.widgets import LEFT, request_maps_of
 
 
 class IonPanel:
-    """Slider of the first and the last ion.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        With a run.
-    ions : tuple of int or None
-        Ions at the start; None for all.
-    request : callable
-        As for `request_maps_of`.
-    """
+    """Slider of the first and the last ion."""
 
     def __init__(self, explorer: Explorer, ions: tuple[int, int] | None, request: Callable[[bool], None]) -> None:
         self._all, self._request = explorer.first_and_last, request

@@ -16,10 +16,10 @@ from bokeh.models import (
 )
 from bokeh.palettes import Inferno256, interp_palette
 
+from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.explore.style import STYLES, VEIL
 from apt_evap.explore.widgets import LEFT, color_bar, show_extent, square
-from apt_evap.plot.limits import color_limits, common_limits
 
 MODES = ("side by side", "difference", "blink")
 """What the page shows beside the simulated map, if there is a measured one."""
@@ -30,17 +30,7 @@ _OUTSIDE = "#00000000"
 
 
 class MapFigures:
-    """Figures of the maps, and the widgets that choose what they show.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Has a run, a measurement, or both.
-    maps : ExplorerMaps
-        Maps at the start.
-    document : bokeh.document.Document
-        Calls the function that exchanges the maps in the mode "blink".
-    """
+    """Figures of the maps, and the widgets that choose what they show."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, document: Document) -> None:
         self._explorer, self._maps, self._document = explorer, maps, document

@@ -41,8 +41,6 @@ class Marks:
 
     Parameters
     ----------
-    material : Material or str
-        The crystal.
     poles : list
         Pairs of the index of a family, in the order of `families`, and a position (x, y) [mm].
     lines : list
@@ -70,21 +68,6 @@ class Marks:
         A user knows the family of a pole, not the member. The first pole is the first member. For the second pole, or
         for the first zone line if there is one pole, all different members are tried. The others are then those next
         to their marks.
-
-        Parameters
-        ----------
-        scale, centre, mirror
-            As in `fit_orientation`.
-
-        Returns
-        -------
-        list of FittedOrientation
-            At most six, by their RMS to 0.1 mm; of equal ones first those with a field of view as instruments have.
-
-        Raises
-        ------
-        ValueError
-            If there are too few marks, or as in `fit_orientation`.
         """
         if len(self.poles) < 2 and (not self.poles or not self.lines or scale is None):
             raise ValueError("mark two poles, or one pole and a zone line through it with a scale")
@@ -167,23 +150,7 @@ def overlay(
     like: DetectorMap,
     families: int = FAMILIES,
 ) -> Overlay:
-    """Poles and zone lines of an orientation on a map.
-
-    Parameters
-    ----------
-    orientation : Orientation
-        Orientation of the crystal.
-    projection : Projection or RegisteredProjection
-        Projection onto the map.
-    like : DetectorMap
-        The map.
-    families : int
-        Families of poles.
-
-    Returns
-    -------
-    Overlay
-    """
+    """Poles and zone lines of an orientation on a map."""
     left, right, lower, upper = like.extent
     crystal = poles(orientation.material, families)
 

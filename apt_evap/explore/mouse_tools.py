@@ -19,17 +19,7 @@ class MouseTool(NamedTuple):
 
 
 class MouseTools:
-    """Widgets that choose a tool.
-
-    Parameters
-    ----------
-    figures : sequence of bokeh.plotting.figure
-        The maps.
-    tools : mapping of str to MouseTool
-        Further tools than "move", in their order; "atoms" is the one of the start.
-    show_whole : callable
-        Undoes zoom and shift.
-    """
+    """Widgets that choose a tool."""
 
     def __init__(self, figures: Sequence[Any], tools: Mapping[str, MouseTool], show_whole: Callable[[], None]) -> None:
         self._figures = figures

@@ -59,20 +59,8 @@ class Page:
 
     Parameters
     ----------
-    explorer : Explorer or None
-        Computes all numbers; None for a page on which files are opened.
-    document : bokeh.document.Document
-        Gets the page.
-    settings : ExplorerSettings, optional
-        What is shown first; by default `Explorer.start`.
-    registration_of : callable, optional
-        Makes a `Registration` from the text of a user; without it, the registration cannot be typed.
-    opened : callable, optional
-        Reads a file, from its path and the document; the function that it returns makes the page again.
     later : callable, optional
         Calls a function in the thread of the document, after a delay [ms]; by default the document itself does.
-    state : ServerState, optional
-        What outlives the page.
     """
 
     def __init__(

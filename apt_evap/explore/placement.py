@@ -16,17 +16,6 @@ _COMMON = 0.6  # of the area that must stay common
 def misplaced(simulated: DetectorMap, measured: DetectorMap, registration: Registration) -> str:
     """Say how a registered map lies better, about the axis of the specimen; "" if it lies well.
 
-    Parameters
-    ----------
-    simulated, measured : DetectorMap
-        Maps in the measured frame, on the same bins.
-    registration : Registration
-        Transform into the measured frame.
-
-    Returns
-    -------
-    str
-
     Notes
     -----
     Compared are the correlations of the flattened maps, as in `register`, for rotations by 3 degrees and three scales.

@@ -14,17 +14,7 @@ _LABEL = (0.08, 0.04)  # width and height of a label, over the width of the map
 
 
 class PolePanel:
-    """Drawings over the maps, and the button that shows them.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        With a run.
-    maps : ExplorerMaps
-        Maps at the start.
-    figures : sequence of bokeh.plotting.figure
-        The maps.
-    """
+    """Drawings over the maps, and the button that shows them."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, figures: Sequence[Any]) -> None:
         self._explorer, self._maps = explorer, maps

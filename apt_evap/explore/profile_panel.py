@@ -19,21 +19,7 @@ _COLORS = {"simulated": "#4aa3ff", "measured": "#ffb04a"}
 
 
 class ProfilePanel:
-    """Figure of the profiles, and their line on the maps.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Computes the profiles.
-    maps : ExplorerMaps
-        Maps at the start.
-    figures : sequence of bokeh.plotting.figure
-        The maps.
-    names : sequence of str
-        What each of them shows: "simulated" or "measured".
-    note : callable
-        Shows a sentence.
-    """
+    """Figure of the profiles, and their line on the maps."""
 
     def __init__(
         self,

@@ -22,25 +22,7 @@ class _SearchStoppedError(Exception):
 
 
 class RegistrationPanel:
-    """Widgets of the registration.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        With a run and a measurement.
-    perturbation : callable
-        Returns the emission of the sliders.
-    registration_of : callable or None
-        Makes a `Registration` from the text of a user; None if it cannot be typed.
-    request : callable
-        As for `request_maps_of`.
-    note : callable
-        Shows a sentence.
-    later : callable
-        As for `Page`.
-    judged : callable
-        Receives maps, and whether they are alike.
-    """
+    """Widgets of the registration."""
 
     def __init__(
         self,
@@ -87,13 +69,7 @@ class RegistrationPanel:
     # ---- the search ------------------------------------------------------------------------------------------------
 
     def search(self, perturbations: Sequence[Perturbation] | None = None) -> None:
-        """Search in another process, which leaves this one to the page; it ends an earlier one.
-
-        Parameters
-        ----------
-        perturbations : sequence of perturbation, optional
-            As in `Explorer.register`.
-        """
+        """Search in another process, which leaves this one to the page; it ends an earlier one."""
         self.close()
         number, start = self._number, time.monotonic()
 

@@ -14,15 +14,7 @@ from apt_evap.explore.widgets import LEFT
 
 
 class RingsPanel:
-    """Table of the rings.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        Computes the rings.
-    later : callable
-        As for `Page`.
-    """
+    """Table of the rings."""
 
     def __init__(self, explorer: Explorer, later: Callable[[Callable[[], None], int], Any]) -> None:
         self._explorer, self._later = explorer, later

@@ -23,25 +23,7 @@ _SIMULATE = "simulate this specimen"
 
 
 class RunPanel:
-    """Widgets that write the settings file, and start and stop its run.
-
-    Parameters
-    ----------
-    settings : callable
-        Returns the `StartSettings` for minutes and threads; called in a thread.
-    name : str
-        Settings file that is proposed.
-    state : ServerState
-        Has the run of all pages.
-    later : callable
-        As for `Page`.
-    put_code : callable
-        Shows the text of the settings file.
-    open_run : callable, optional
-        Opens a file on the page.
-    search_before : callable, optional
-        Calls a function after a search for candidates, if there are none.
-    """
+    """Widgets that write the settings file, and start and stop its run."""
 
     def __init__(
         self,

@@ -26,21 +26,7 @@ class ServerState:
 
 
 class RunProgress:
-    """Shows the run of all pages.
-
-    Parameters
-    ----------
-    state : ServerState
-        Has the run of all pages.
-    text : bokeh.models.Div
-        Shows its progress, and why it ended.
-    buttons : dict of Button to str
-        Buttons that stop the run while it is active, and their labels at other times; "" hides one.
-    later : callable
-        As for `Page`.
-    open_run : callable, optional
-        Opens the file of the run at its end.
-    """
+    """Shows the run of all pages."""
 
     def __init__(
         self,

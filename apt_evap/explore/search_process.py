@@ -36,29 +36,7 @@ class SearchProcess:
         self._process.terminate()
 
     def call(self, function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any] = {}) -> Any:
-        """Call a function there.
-
-        Parameters
-        ----------
-        function : callable
-            Function of a module.
-        arguments : sequence
-            Arguments of the function.
-        options : mapping
-            Keyword arguments of the function.
-
-        Returns
-        -------
-        object
-            Result of the function.
-
-        Raises
-        ------
-        ValueError
-            If the function raises any error.
-        ProcessEnded
-            If the process ends.
-        """
+        """Call a function there."""
         try:
             self._pipe.send((function, arguments, dict(options)))
             result, sentence = self._pipe.recv()

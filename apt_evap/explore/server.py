@@ -58,35 +58,7 @@ def serve(
     with_file: Callable[[str], tuple[Explorer | None, ExplorerSettings | None]] | None = None,
     origins: Sequence[str] = (),
 ) -> tuple[Server, str]:
-    """Make the server of a page that only the holder of its address can open, from this machine.
-
-    Parameters
-    ----------
-    explorer : Explorer or None
-        Computes all numbers; None to open files on the page.
-    settings : ExplorerSettings, optional
-        What is shown first.
-    port : int
-        Port on 127.0.0.1; 0 for a free one.
-    registration_of : callable, optional
-        As for `Page`.
-    with_file : callable, optional
-        Reads one more file, from its path, and returns the explorer and the settings that show it.
-    origins : sequence of str
-        Further addresses ``"HOST:PORT"`` under which a browser opens the page, as behind a proxy.
-
-    Returns
-    -------
-    server : bokeh.server.server.Server
-        Its ``io_loop.start()`` serves the page.
-    url : str
-        Address with a signed session.
-
-    Raises
-    ------
-    OSError
-        If the port is in use.
-    """
+    """Make the server of a page that only the holder of its address can open, from this machine."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         probe.bind((_ADDRESS, port))

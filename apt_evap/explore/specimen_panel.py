@@ -17,17 +17,7 @@ _MOST_ATOMS = 500  # highlighted
 
 
 class SpecimenPanel:
-    """View of the specimen and its widgets.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        With a run.
-    maps : ExplorerMaps
-        Maps at the start.
-    figures : sequence of bokeh.plotting.figure
-        The maps.
-    """
+    """View of the specimen and its widgets."""
 
     def __init__(self, explorer: Explorer, maps: ExplorerMaps, figures: Sequence[Any]) -> None:
         self._explorer, self._maps = explorer, maps

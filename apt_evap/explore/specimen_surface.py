@@ -39,25 +39,6 @@ class SurfaceAtoms(NamedTuple):
 def surface_atoms(run: Run, color: str = "order", ions: tuple[int, int] | None = None) -> SurfaceAtoms:
     """Select the atoms on the surface of those that leave in a run, before the first of these ions.
 
-    Parameters
-    ----------
-    run : Run
-        The run.
-    color : {"order", "field", "charge", "phase"}
-        Quantity of the values: number in the sequence; field and charge of the atom just before it left, at the
-        simulated voltage; index into ``run.phase_names``.
-    ions : tuple of int, optional
-        First ion, and the one after the last; by default all. Atoms that left before are not on the surface.
-
-    Returns
-    -------
-    SurfaceAtoms
-
-    Raises
-    ------
-    ValueError
-        If the name is unknown, or there is no ion.
-
     Notes
     -----
     On the surface are atoms that lack a neighbour within 1.5 nearest neighbour distances: 0.98 to 1 of those that are

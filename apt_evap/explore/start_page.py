@@ -39,17 +39,7 @@ _DROP_STYLE = """
 
 
 class StartPage:
-    """Widgets of the page without a file.
-
-    Parameters
-    ----------
-    open_file : callable
-        Opens a file.
-    state : ServerState
-        Has the run of all pages.
-    later : callable
-        As for `Page`.
-    """
+    """Widgets of the page without a file."""
 
     def __init__(
         self,

@@ -19,15 +19,7 @@ READOUT_DELAY = 60
 
 
 class SummaryPanel:
-    """Texts above the maps.
-
-    Parameters
-    ----------
-    explorer : Explorer or None
-        What is open.
-    later : callable
-        As for `Page`.
-    """
+    """Texts above the maps."""
 
     def __init__(self, explorer: Explorer | None, later: Callable[[Callable[[], None], int], Any]) -> None:
         self._later = later

@@ -163,11 +163,6 @@ class Tabs:
     """Widgets of which one is shown, below a row of titles.
 
     Bokeh's own tabs do not draw the figures in them where their place has the width of a grid.
-
-    Parameters
-    ----------
-    contents : dict of str to sequence
-        Widgets by title; the first ones are shown at the start.
     """
 
     def __init__(self, contents: dict[str, Sequence[Any]]) -> None:

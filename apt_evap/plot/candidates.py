@@ -28,8 +28,15 @@ def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.o
     -------
     ndarray of matplotlib.axes.Axes
         Shape (2 n + 1,): the map, and of every candidate the map with its poles, and its pattern.
+
+    Raises
+    ------
+    ValueError
+        If the result has no candidate, as of a map that can show no orientation.
     """
     check_kind(result, "result", Indexing, "an Indexing, the result of index")
+    if not result.candidates:
+        raise ValueError(f"result must have a candidate to draw, got {result!r}: {result.reason}")
     n = (1 if result.decided else SHOWN) if candidates is None else check_count(candidates, "candidates")
     shown = result.candidates[:n]
     if len(shown) == 1:

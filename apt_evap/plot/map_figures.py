@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.binning import bins_for, shown_bins
+from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.maps.crystallography.directions import label as plane_label
 from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
-from apt_evap.plot.limits import color_limits
 from apt_evap.simulation.run import Run
 
 RIM = "0.45"

@@ -10,9 +10,9 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_number
+from apt_evap.detection.color_limits import common_limits
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.plot._figure import add_colorbar, new_figure
-from apt_evap.plot.limits import common_limits
 from apt_evap.plot.map_figures import detector_map
 
 _INCH = 25.4  # mm

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_kind
+from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import add_colorbar, new_figure, set_title
-from apt_evap.plot.limits import color_limits
 from apt_evap.plot.map_figures import binned
 from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges

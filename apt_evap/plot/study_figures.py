@@ -9,9 +9,9 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_number
+from apt_evap.detection.color_limits import common_limits
 from apt_evap.fit.study import Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
-from apt_evap.plot.limits import common_limits
 from apt_evap.plot.map_figures import detector_map
 
 _MARK = "#00d0ff"  # visible on all colours of both maps

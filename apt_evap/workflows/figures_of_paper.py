@@ -69,6 +69,7 @@ _LINES = {  # of nickel [111]; there are three of each kind
 }
 _TURNS = (0, 120, 240)  # [degrees]
 _PROFILE_BINS = 30
+_MOST_BINS = 96  # of a measured map: the grid of figure 4 has 180 points
 _CERTAIN = 3.0  # errors: a difference that is not chance
 _TWINS = (
     "The experiments of the paper are not public. The measured map is that of a twin: another specimen, with other "
@@ -251,6 +252,8 @@ def _figure_2(radius: int, threads: int | None) -> tuple[Figure, PaperFigure]:
     )
     title = "Hits of six atoms each of Al[012] and Ni[111] for energies from 0 to 1 eV. Atoms and hits have one colour."
     limits = "One specimen each; the atoms are at kinks, at steps and in rows along steps, not those of the paper."
+    if radius != FULL.radius:  # 0.7 to 1.4 of the effect of 0.5 eV at 20 a, 0.2 to 0.7 at 80 a
+        limits += f" The jump shrinks with the radius: R = {radius} a, the paper has {FULL.radius} a (--full)."
     return figure, PaperFigure(2, title, claims, limits, numbers)
 
 
@@ -494,7 +497,7 @@ class PaperOfMap:
 
     def __init__(self, made: Twin, element: str, *, threads: int | None, progress: Any) -> None:
         bins = len(made.measured_map.values)
-        settings = FitSettings(bins=min(bins, FULL.bins), resamples=FULL.resamples, objective="similarity")
+        settings = FitSettings(bins=min(bins, _MOST_BINS), resamples=QUICK.resamples, objective="similarity")
         registration = made.registration
         name = f"{element}, measured"
         self._fitted = _Fitted(name, made.run, made.measured_map, settings, threads, progress, registration)
@@ -584,12 +587,12 @@ def paper(
                 "full is for the figures of twins: the size of the tip of a measured map follows from minutes"
             )
         source = source_of(measured)
-        content = source.read()  # before anything is written
+        content = source.read(note)  # before anything is written
         name = as_material(element if element is not None else "").name
-        _check_folder(folder, {"measured": source.name, "element": name})
+        _check_folder(folder, source.made_from() | {"element": name})
         try:
             made = twin(
-                replace(source, read=lambda: content),
+                replace(source, read=lambda _: content),
                 element,  # type: ignore[arg-type]
                 folder=folder / TWIN,
                 threads=threads,

@@ -15,6 +15,7 @@ from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollU
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.workflows.simulate_file import simulate
+from apt_evap.workflows.twin_of_map import advice_as_notes
 
 RUNS = "runs"
 """Folder of the runs and their settings."""
@@ -234,7 +235,9 @@ class PaperRuns:
             return kept
         path = self.folder / run.file(self.size)
         self._note(f"simulating {path.name}")
-        done = simulate(self._write_settings(run), path, threads=self._threads, resume=True, progress=self._progress())
+        settings = self._write_settings(run)
+        with advice_as_notes(self._note):
+            done = simulate(settings, path, threads=self._threads, resume=True, progress=self._progress())
         if done.interrupted:
             raise KeyboardInterrupt
         self._loaded[run] = done.run

@@ -24,7 +24,7 @@ from apt_evap.warnings import WorkflowWarning, warn
 from apt_evap.workflows.maps_of_run import map_summaries, run_maps
 from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
 
-_CONTINUE = "the same command with --resume continues (resume=True in Python)"
+_CONTINUE = "--resume continues (resume=True in Python)"
 
 
 def no_note(text: str) -> None:
@@ -226,7 +226,7 @@ def _evaporated(config: Config, simulation: Simulation, stored: Checkpoint, n_pr
     except KeyboardInterrupt:
         if ions := stored.ions_there():
             path = stored.unfinished if stored.unfinished.exists() else stored.path
-            warn(f"{ions:,} of {n_ions:,} ions are in {str(path)!r}; {_CONTINUE}", WorkflowWarning)
+            warn(f"{ions:,} of {n_ions:,} ions are in {str(path)!r}", WorkflowWarning, _CONTINUE)
         raise
     except RunInterrupted as error:
         config.with_origin(error.run).save(stored.path)
@@ -254,7 +254,7 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
             "use a larger width or a smaller distance in [detector]",
         )
     if run.ended == StopReason.INTERRUPTED:
-        text = f"interrupted; {len(run):,} of {config.n_ions:,} ions are in {str(path)!r}; {_CONTINUE}"
-        warn(text, WorkflowWarning)
+        text = f"interrupted; {len(run):,} of {config.n_ions:,} ions are in {str(path)!r}"
+        warn(text, WorkflowWarning, _CONTINUE)
     elif run.ended:
         warn(f"the run ended early: {run.ended}; its {len(run):,} ions are saved", WorkflowWarning)

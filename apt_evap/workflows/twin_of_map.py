@@ -6,7 +6,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -92,7 +92,8 @@ class _Candidate:
     contrast: float = number("Sum of the amplitudes", at_least=0)
     angle_error: float = number("Standard error of the orientation", at_least=0, unit="degrees")
     pattern_radius: float = number("Radius of the tip of the pattern", above=0, unit="nm")
-    compression: float | None = number("Image compression", default=None, above=0)
+    barrel: float = number("Barrel term of the lens", default=0.0, unit="1/rad^2")
+    rim_change: float = number("Relative change of the scale from the centre to the rim", default=0.0)
 
 
 @settings
@@ -142,12 +143,13 @@ class _Options:
         return None if self.ranges is None else read_ranges(self.ranges)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values of what changes a result, by the names of the options of the command."""
+        """Plain values of what changes a result, by the options of the command."""
         values = {name: getattr(self, name) for name in ("minutes", "field_factor", "distance")}
         values |= {"element": write_material(as_material(self.element))}
         values |= {"efficiency": self.efficiency, "scales": self.scales, "lens": self.electrode}
         values |= {"pole": self.poles or None, "line": self.lines or None}
-        return {name: to_plain(value) for name, value in values.items()}
+        record = {f"--{name.replace('_', '-')}": to_plain(value) for name, value in values.items()}
+        return record | {"file of --ranges": None if self.ranges is None else sha256_of(self.ranges)}
 
 
 class Twin:
@@ -176,17 +178,15 @@ class Twin:
         self.folder = folder
         self._source, self._options, self._threads = source, options, threads
         self._progress, self._note, self._command = progress, note, command
-        ranges = None if options.ranges is None else sha256_of(options.ranges)
-        files = {"FILE": None, "file of --undistort": None, **source.hashes(), "file of --ranges": ranges}
-        made_from = {**source.options, **options.to_plain()}
-        self._kept = KeptFiles(folder, files, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
+        made_from = source.made_from() | options.to_plain()
+        self._kept = KeptFiles(folder, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
 
     # ---- results -----------------------------------------------------------------------------------------------------
 
     @cached_property
     def measured(self) -> Hits | DetectorMap:
         """The measured ions, or the measured map."""
-        return check_kind(self._source.read(), "measured", (Hits, DetectorMap), "Hits or a DetectorMap")
+        return check_kind(self._source.read(self._note), "measured", (Hits, DetectorMap), "Hits or a DetectorMap")
 
     @cached_property
     def measured_map(self) -> DetectorMap:
@@ -225,9 +225,12 @@ class Twin:
         try:
             return Candidate(
                 orientation=Orientation(crystal, best.axis, best.rotation),
-                projection=Projection(best.scale, best.centre, compression=best.compression),
+                projection=Projection(best.scale, best.centre, barrel=best.barrel),
                 pattern=min(patterns, key=lambda pattern: abs(pattern.apex_radius - best.pattern_radius)),
-                **{name: getattr(best, name) for name in ("score", "confidence", "rolled", "contrast", "angle_error")},
+                **{
+                    name: getattr(best, name)
+                    for name in ("score", "confidence", "rolled", "contrast", "angle_error", "rim_change")
+                },
             )
         except ValueError as error:
             raise FileError(f"{str(self.folder / FACTS)!r} is not a result of apt-evap twin: {error}") from None
@@ -375,7 +378,7 @@ class Twin:
 
     def _as_read(self):
         """The measurement, with its file for the report, without reading it again."""
-        return MeasuredSource(lambda: self.measured, self._source.path)
+        return MeasuredSource(lambda _: self.measured, self._source.path)
 
     # ---- texts -------------------------------------------------------------------------------------------------------
 
@@ -402,17 +405,19 @@ class Twin:
 
     def _reconstruct_command(self, study):
         """Command that reconstructs with the constants, "" if they are in doubt, or without file or flight length."""
-        known, path, lens = self._known(study).arguments, self._source.path, self._options.lens
-        if "distance" not in known or path is None:
+        known, file, lens = self._known(study).arguments, self._source.file, self._options.lens
+        if "distance" not in known or file is None:
             return ""
         element = write_material(as_material(self._options.element))
-        words = ["apt-evap", "reconstruct", path_word(path), "--element", element]
+        # the flight length is one of the constants
+        words = ["apt-evap", "reconstruct", *replace(file, distance=None).words("peaks"), "--element", element]
         for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
             if name in known:
-                value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
+                # masses follow from the flight length
+                value = f"{known[name]}" if name in ("projection", "distance") else f"{known[name]:.4g}"
                 words += [f"--{name.replace('_', '-')}", value]
         words += [] if lens is None else ["--lens", lens if isinstance(lens, str) else _lens_text(lens)]
-        return shlex.join([*words, *self._source.words])
+        return shlex.join(words)
 
     def _made_answer(self):
         """Constants of the measurement, and what they depend on, as the content of a file."""
@@ -456,11 +461,6 @@ def advice_as_notes(note: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = show
-
-
-def path_word(path: str | Path) -> str:
-    """Word of a command line, a path with ./ before a dash, which would make an option of it."""
-    return f".{os.sep}{path}" if isinstance(path, Path) and str(path).startswith("-") else str(path)
 
 
 def _lens_text(lens):
@@ -552,7 +552,7 @@ def twin(
     >>> made.report()  # doctest: +SKIP
     PosixPath('R5083_twin/study/report.html')
     """
-    source = source_of(measured)
+    source = source_of(measured, distance)
     options = _Options(
         element=element,
         minutes=minutes,

@@ -44,7 +44,7 @@ def save_picture(
 
     With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
     """
-    from apt_evap.plot.limits import common_limits  # with Matplotlib
+    from apt_evap.detection.color_limits import common_limits  # with Matplotlib
 
     if width is None:
         axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title, **colors)

@@ -107,3 +107,12 @@ def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):
     # some 300 ions within 3 degrees, 6 %; measured on a cap of aluminium: 0.74 against 1.08 and 1.06
     assert density(found.compression) < 0.85
     assert min(density(0.87 * found.compression), density(1.15 * found.compression)) > 0.93
+
+
+def test_the_scatter_is_the_standard_deviation_of_the_ratio():
+    run = Receding(1.5, "equidistant")
+    factor = np.exp(0.05 * np.random.default_rng(2).normal(size=len(run)))  # of the angle on the detector
+    hits = run._hits
+    run._hits = ae.Hits(x=hits.x * factor, y=hits.y * factor, outcome=hits.outcome)
+    # 5 % of 1.5; the sites add 1 to 2 % of the angle, in quadrature; percentiles of 10,000 ions: 1.5 %
+    assert ae.analysis.image_compression(run).scatter == pytest.approx(0.075, rel=0.08)

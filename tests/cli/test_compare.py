@@ -31,10 +31,10 @@ NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
 
 
 @pytest.fixture(scope="module")
-def made(small_tip, tmp_path_factory):
+def made(small_tip, made_once, tmp_path_factory):
     """A run, and what would have been measured of the same ions with other random numbers: ions, a map, a run."""
     folder = tmp_path_factory.mktemp("made")
-    run = ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False)
+    run = made_once(small_tip, 2000, seed=1, **ROUGH)
     other = replace(run, seed=2)
     run.save(folder / "run.h5")
     other.save(folder / "other.h5")

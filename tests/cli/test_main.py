@@ -1,6 +1,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -332,7 +333,8 @@ def test_memory_and_interrupts_are_no_tracebacks_but_bugs_are(folder, capsys, mo
     assert "not enough memory" in failed(capsys, "run", "small.toml", "--quiet")
     raising(KeyboardInterrupt())
     assert main(["run", "small.toml", "--quiet"]) == 130
-    assert capsys.readouterr().err == "apt-evap: interrupted\n"
+    go_on = "to go on: apt-evap run small.toml --quiet --resume"
+    assert capsys.readouterr().err == f"apt-evap: interrupted, what is done is kept; {go_on}\n"
     raising(ZeroDivisionError())
     with pytest.raises(ZeroDivisionError):
         main(["run", "small.toml", "--quiet"])
@@ -399,10 +401,40 @@ def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     assert process.returncode == code
     run = load(folder / "small.h5")
     assert run.ended == "interrupted" and 0 < len(run) < 5000
-    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5'; the same command with --resume continues"
+    said = f"interrupted; {len(run):,} of 5,000 ions are in 'small.h5': --resume continues"
     assert said.encode() in seen
     assert b"Traceback" not in seen and out.endswith("wrote small.h5\nwrote small.png\n")
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
+
+
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
+    """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""
+
+    def progress(quiet):
+        return lambda ions, n_ions: signal.raise_signal(sent) if 0 < ions < n_ions else None
+
+    ions = 3_000  # several chunks, so that some are left at the interrupt
+    with monkeypatch.context() as patched:
+        patched.setattr("apt_evap.cli._progress.run_progress", progress)
+        code = main(["run", "small.toml", "--ions", str(ions), "--threads", "1", "--force"])
+    assert code == (143 if sent == signal.SIGTERM else 130)
+    told = capsys.readouterr().err
+    assert 0 < len(load("small.h5")) < ions
+    (command,) = re.findall(r"^apt-evap: interrupted, what is done is kept; to go on: (.*)$", told, re.MULTILINE)
+    assert command == f"apt-evap run small.toml --ions {ions} --threads 1 --resume"
+    assert main(shlex.split(command)[1:]) == 0
+    assert len(load("small.h5")) == ions
+
+
+def test_other_commands_start_again(folder, monkeypatch, capsys):
+    def read(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("apt_evap.cli._files.read_file", read)
+    assert main(["map", "a b.epos", "--bins", "32"]) == 130
+    told = capsys.readouterr().err
+    assert told == "apt-evap: interrupted, nothing is kept; to start again: apt-evap map 'a b.epos' --bins 32\n"
 
 
 # ---- map -------------------------------------------------------------------------------------------------------------
@@ -686,6 +718,12 @@ def test_a_selection_by_a_missing_column_is_refused(folder, capsys):
 )
 def test_wrong_arguments_are_one_sentence(folder, capsys, arguments, sentence):
     assert sentence in failed(capsys, *arguments)
+
+
+@pytest.mark.parametrize("module", ["apt_evap.cli", "apt_evap.cli.main"])
+def test_the_command_line_is_a_module(module):
+    told = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True)
+    assert (told.returncode, told.stdout) == (0, f"apt-evap {__version__}\n")
 
 
 def test_version_and_help(capsys):

@@ -111,10 +111,10 @@ def test_ions_without_voltages(measured, capsys):
 
 
 @pytest.fixture(scope="module")
-def radius5(tmp_path_factory):
+def radius5(made_once, tmp_path_factory):
     """A run of 1,200 ions of a tip with a radius of 5 nm, and its file."""
     tip = ae.Tip("Ni", apex_radius=5.0, axis=(1, 1, 1), shank_length=5.0, depth=1.5)
-    run = ae.Simulation(tip, seed=1).run(1200, progress=False)
+    run = made_once(tip, 1200, seed=1)
     path = tmp_path_factory.mktemp("radius") / "r5.h5"
     run.save(path)
     return run, path

@@ -109,7 +109,8 @@ def test_ctrl_c_while_libraries_are_loaded(folder):
     (folder / "h5py.py").write_text("import signal, time\nsignal.raise_signal(signal.SIGINT)\ntime.sleep(60)\n")
     path = os.pathsep.join([str(folder), HERE])
     found = shell(folder, "", "run", "small.toml", PYTHONPATH=path)
-    assert found == (130, "", "apt-evap: interrupted\n")
+    go_on = "what is done is kept; to go on: apt-evap run small.toml --resume"
+    assert found == (130, "", f"apt-evap: interrupted, {go_on}\n")
 
 
 @pytest.mark.slow

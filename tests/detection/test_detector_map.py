@@ -10,11 +10,11 @@ from matplotlib.text import Text
 
 from apt_evap import plot
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisation
+from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
-from apt_evap.plot.limits import color_limits
 from apt_evap.plot.map_figures import describe
 
 SILICON = Path(__file__).parents[3] / "shared" / "data" / "Si.epos"

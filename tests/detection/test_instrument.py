@@ -53,11 +53,8 @@ def dead_ions(hits, dead_time, dead_zone):
 
 @pytest.fixture(scope="module")
 def real(made_once, nickel):
-    def make():
-        tip = ae.Tip(nickel, 8 * nickel.a, axis=(1, 1, 1), shank_length=8 * nickel.a, offset_seed=1)
-        return ae.Simulation(tip, seed=1, n_threads=1).run(400, progress=False).at_evaporation_field()
-
-    return made_once("instrument", make)
+    tip = ae.Tip(nickel, 8 * nickel.a, axis=(1, 1, 1), shank_length=8 * nickel.a, offset_seed=1)
+    return made_once(tip, 400, seed=1).at_evaporation_field()
 
 
 # ---- one effect after the other --------------------------------------------------------------------------------------

@@ -135,3 +135,27 @@ def test_what_points_away_has_no_place():
 def test_what_is_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Projection(**settings)
+
+
+@pytest.mark.parametrize("barrel", [0.3, -0.4])
+def test_a_barrel_term_is_its_polynomial_and_back(barrel):
+    lens = Projection(50.0, (1.0, -2.0), barrel=barrel)
+    angle = np.array([0.0, 0.1, 0.4, 0.8])
+    directions = np.column_stack([np.sin(angle), np.zeros(4), np.cos(angle)])
+    places = lens.places(directions)
+    assert places[:, 0] - 1.0 == pytest.approx(50 * angle * (1 - barrel * angle**2), abs=1e-12)
+    assert lens.directions(places) == pytest.approx(directions, abs=1e-12)
+    assert lens.angles(places) == pytest.approx(angle, abs=1e-12)
+    assert lens.change_of_scale(places[3, 0] - 1.0) == pytest.approx(-barrel * 0.64)
+    # angles in the specimen twice as large are at the same places
+    assert lens.compressed(2.0).angles(places) == pytest.approx(2 * angle)
+
+
+def test_a_barrel_ends_where_it_folds_the_image():
+    lens = Projection(50.0, barrel=0.3)
+    last = 1 / np.sqrt(0.9)  # where the derivative 1 - 3 b t^2 is 0
+    assert lens.last_angle == pytest.approx(last) and lens.rim == pytest.approx(50 * last * (1 - 0.3 * last**2))
+    beyond = lens.places([[np.sin(last + 0.1), 0.0, np.cos(last + 0.1)]])
+    assert np.isnan(beyond).all()
+    with pytest.raises(ValueError, match="not both"):
+        Projection(50.0, compression=1.5, barrel=0.1)

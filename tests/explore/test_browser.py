@@ -62,7 +62,7 @@ def explorer_in(folder, *words):
 def served(small_tip, made_once, tmp_path_factory):
     """Address of a run beside ions."""
     folder = tmp_path_factory.mktemp("served")
-    run = made_once("explored", lambda: ae.Simulation(small_tip, seed=1, **ROUGH).run(2000, progress=False))
+    run = made_once(small_tip, 2000, seed=1, **ROUGH)
     run.save(folder / "run.h5")
     hits = replace(run, seed=2).hits(ae.RollUp(0.2))
     ae.write(folder / "ions.epos", ae.Hits(x=hits.x, y=hits.y).within_circle(60.0))

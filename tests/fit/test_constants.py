@@ -6,19 +6,16 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.plot.report.measurement_report import measurement_section
 
 SCALE, FIELD, VOLUME = 60.0, 35.0, 0.352**3 / 4  # mm/rad, V/nm, nm^3
 
 
 @pytest.fixture(scope="module")
-def measured():
+def measured(indexed_nickel):
     """Map and candidate of nickel at a scale of 60 mm/rad."""
-    truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
-    pattern = master_patterns("fcc")[0]
-    detector_map = pattern.map(truth, ae.detection.Projection(SCALE), 70.0, ions=30_000, rolled=0.5, seed=1)
-    return detector_map, ae.index(detector_map, "Ni", scales=(54, 66), patterns=[pattern]).best
+    _, indexing = indexed_nickel
+    return indexing.map, indexing.best
 
 
 def ions_of(detector_map, angle, factor, n=30_000, first=30.0):

@@ -11,15 +11,14 @@ TWINS = range(100, 106)
 
 
 @pytest.mark.slow
-def test_hidden_energies_lie_inside_the_intervals(made_once):
+def test_hidden_energies_lie_inside_the_intervals(kept_runs):
     path = Path(__file__).parents[2] / "articles" / "intervals" / "coverage.py"
     spec = importlib.util.spec_from_file_location("coverage_of_intervals", path)
     coverage = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(coverage)
-    run, *twins = (
-        made_once(f"coverage{number}", lambda number=number: coverage.run_of(number, 14.0, 10_000))
-        for number in (0, *TWINS)
-    )
+    folder = kept_runs / path.stem
+    folder.mkdir(exist_ok=True)
+    run, *twins = (coverage.run_of(number, 14.0, 10_000, folder) for number in (0, *TWINS))
     inside = {MODEL_ERROR: 0, 0.0: 0}
     for number, twin in zip(TWINS, twins, strict=True):
         energy = coverage.hidden_energy(number)

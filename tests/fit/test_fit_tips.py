@@ -18,10 +18,10 @@ def runs(nickel, made_once):
 
     def make(axis, offset):
         tip = ae.Tip(nickel, apex_radius=8 * nickel.a, axis=axis, shank_length=8 * nickel.a, offset_seed=offset)
-        return ae.Simulation(tip, seed=offset, n_threads=1, **ROUGH).run(1500, progress=False)
+        return made_once(tip, 1500, seed=offset, **ROUGH)
 
     return {
-        name: made_once(f"tips {name}", lambda axis=axis, offset=offset: make(axis, offset))
+        name: make(axis, offset)
         for name, axis, offset in (("right", (1, 1, 1), 1), ("axis", (0, 0, 1), 1), ("measured", (1, 1, 1), 2))
     }
 

@@ -58,8 +58,9 @@ def run_of(radius, number, ions):
 
 
 @pytest.fixture(scope="module")
-def family():
-    return [run_of(radius, radius, 1000) for radius in (8, 10, 12, 14)]
+def family(made_once):
+    emissions = [ae.Unperturbed(), ae.RollUp(ENERGY, probability=0.5)]
+    return [made_once(tip(radius, radius), 1000, emissions, responses=False, seed=radius) for radius in (8, 10, 12, 14)]
 
 
 def window(run):

@@ -14,15 +14,11 @@ from apt_evap.cli.main import main
 from apt_evap.config.simulation_file import read_config
 from apt_evap.fit.start_settings import FIELD_FACTOR, MARK, registration_start_of
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.master_pattern import master_patterns
 
 
-@pytest.fixture(scope="module")
-def found():
-    truth = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
-    pattern = master_patterns("fcc")[0]
-    measured = pattern.map(truth, ae.detection.Projection(60.0), 70.0, ions=20_000, rolled=0.5, seed=1)
-    return truth, ae.index(measured, "Ni", scales=(54, 66), patterns=[pattern])
+@pytest.fixture
+def found(indexed_nickel):
+    return indexed_nickel
 
 
 @pytest.mark.slow

@@ -39,12 +39,8 @@ def run(run20):
 @pytest.fixture(scope="module")
 def other(nickel, made_once):
     """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
-
-    def make():
-        tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
-        return ae.Simulation(tip, seed=2, **ROUGH).run(15_000, progress=False)
-
-    return made_once("other", make)
+    tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
+    return made_once(tip, 15_000, seed=2, **ROUGH)
 
 
 HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))

@@ -10,16 +10,14 @@ from apt_evap.maps.crystallography.directions import zones
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing import contrast_search as module
 from apt_evap.maps.indexing.contrast_search import (
-    AXIS_STEP,
     PIECES,
-    SCALE_STEP,
     Terms,
     evidence,
     exact_evidence,
     local_contrast,
     refine_contrast,
-    search_contrast,
 )
+from apt_evap.maps.indexing.joint_search import AXIS_STEP, CONTRAST, SCALE_STEP, JointSearch
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, misorientation
 from apt_evap.maps.indexing.refine import directions_of
@@ -105,7 +103,8 @@ def direct_evidence(disc, patterns, matrix, scale):
     """Evidence of an orientation, without Fourier transforms."""
     terms = Terms(ae.material("Ni"), patterns)
     places, areas = module.places_of()
-    pictures = terms.at(directions_of(places, disc.radius, scale, 0.0) @ matrix, disc.radius / scale).astype(float)
+    directions = directions_of(places, disc.radius, scale, 0.0) @ matrix
+    pictures = terms.at(directions, disc.radius / scale)[0].astype(float)
     pictures -= (pictures @ areas)[:, None]
     pictures /= np.sqrt(pictures**2 @ areas)[:, None]
     cross = (pictures * areas) @ module.picture_of(disc)
@@ -120,7 +119,7 @@ def test_bright_and_dark_lines_give_the_orientation(amplitude):
     disc = disc_of(map_of_lines(orientation, amplitude))
     patterns = master_patterns("fcc")
     terms, picture = Terms(ae.material("Ni"), patterns), module.picture_of(disc)
-    starts = search_contrast(picture, disc.radius, terms, (45.0, 80.0), 8)
+    starts = JointSearch(disc, picture, terms, patterns, (45.0, 80.0)).starts(CONTRAST, 8)
     scores = [start.score for start in starts]
     assert len(starts) == 8
     assert scores == sorted(scores, reverse=True)
@@ -136,12 +135,13 @@ def test_bright_and_dark_lines_give_the_orientation(amplitude):
     assert truth.scale == pytest.approx(SCALE, rel=0.06)
 
 
-def test_the_search_is_the_direct_evidence():
+def test_the_search_is_the_direct_evidence(monkeypatch):
+    monkeypatch.setattr("apt_evap.maps.indexing.joint_search.AXIS_STEP", 2.0)  # so that one step is near the truth
     orientation = ae.Orientation("Ni", axis=(0.30, 0.54, 0.79), rotation=20.0)
     disc = disc_of(map_of_lines(orientation, 0.6))
     patterns = master_patterns("fcc")
-    terms = Terms(ae.material("Ni"), patterns)
-    start = search_contrast(module.picture_of(disc), disc.radius, terms, (SCALE, SCALE), 1)[0]
+    terms, picture = Terms(ae.material("Ni"), patterns), module.picture_of(disc)
+    start = JointSearch(disc, picture, terms, patterns, (SCALE, SCALE)).starts(CONTRAST, 1)[0]
     # both take the nearest pixel, of equal directions that are not the same
     direct = direct_evidence(disc, patterns, start.matrix, SCALE)
     assert start.score == pytest.approx(direct, rel=0.1) and start.score > 50

@@ -10,18 +10,21 @@ from scipy.spatial.transform import Rotation
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import plane_normals
 from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.indexing import orientation_search as polar_pictures
+from apt_evap.maps.indexing.contrast_search import picture_of, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.index_map import DECIDED, LEAST_IONS, Candidate, Indexing
+from apt_evap.maps.indexing.joint_search import AXIS_STEP, COUNTED, COUNTS, JointSearch
 from apt_evap.maps.indexing.marked_poles import marks_of
 from apt_evap.maps.indexing.master_pattern import master_patterns, mixture
 from apt_evap.maps.indexing.orientation_search import (
-    AXIS_STEP,
+    Start,
     about_axis,
     axes_of,
     disc_of,
     flattened,
+    flattened_by_rings,
     misorientation,
-    search,
 )
 from apt_evap.maps.indexing.refine import bins_of, deviance, refine
 from apt_evap.maps.indexing.two_criteria import angle_between
@@ -177,14 +180,14 @@ def test_an_axis_of_each_equal_set_is_searched():
 
 def test_the_search_is_the_direct_correlation():
     """Its best score against the correlation of the same pictures, computed without Fourier transforms."""
-    from apt_evap.maps.indexing import orientation_search as module
-
+    module = polar_pictures
     _, map = made("fcc", (0.30, 0.54, 0.79), 0.0, rolled=0.0)
-    disc = disc_of(map)
+    disc = flattened_by_rings(disc_of(map))
     pattern = master_patterns("fcc")[0]
-    start = search(disc, (pattern,), (58.0, 58.0), 1)[0]
+    search = JointSearch(disc, picture_of(disc), terms_of(ae.material("Ni")), (pattern,), (58.0, 58.0))
+    start = search.starts(COUNTED, 1)[0]
     radii, azimuths = module.polar_grid(module.RINGS, module.AZIMUTHS)
-    slow, weights = module._slow(radii, azimuths)
+    slow, weights = module.slow_changes(radii, azimuths)
     ring, phi = (each.ravel() for each in np.meshgrid(radii, azimuths, indexing="ij"))
     theta = ring * disc.radius / 58.0
     directions = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
@@ -194,15 +197,16 @@ def test_the_search_is_the_direct_correlation():
     fit = np.linalg.lstsq(densities.T, picture, rcond=None)[0]
     direct = np.linalg.norm(densities.T @ fit) / np.linalg.norm(picture)
     # the search takes the nearest pixel of the pattern, here it is interpolated
-    assert start.score == pytest.approx(direct, abs=0.03) and start.scale == pytest.approx(58.0)
+    correlation = np.sqrt(1 - np.exp(-start.score / COUNTS))
+    assert correlation == pytest.approx(direct, abs=0.03) and start.scale == pytest.approx(58.0)
 
 
 def test_refinement_never_lowers_the_likelihood():
-    _, map = made("fcc", (0.30, 0.54, 0.79), 20.0)
+    orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0)
     disc = disc_of(map)
     bins = bins_of(disc)
     densities = master_patterns("fcc")[0].smoothed(0.7)
-    start = search(disc, master_patterns("fcc")[:1], (50.0, 70.0), 1)[0]
+    start = Start(Rotation.from_rotvec((1, 1, 0), degrees=True).as_matrix() @ orientation.matrix, 58.0, 0.0)
     gains = [refine(bins, disc, densities, start.matrix, start.scale, steps=n).gain for n in (4, 8, 20)]
     assert gains[0] <= gains[1] + 1e-6 <= gains[2] + 2e-6
     last = refine(bins, disc, densities, start.matrix, start.scale)
@@ -322,9 +326,20 @@ def test_dark_lines_do_not_divide_the_disc():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("kind", ["zeros", "one hot bin", "row", "thin", "few bins"])
-def test_maps_that_are_none_are_refused(kind):
-    counts = np.random.default_rng(1).poisson(3.0, (128, 128))
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        ("zeros", "hits"),
+        ("one hot bin", "field of view"),
+        ("row", "field of view"),
+        ("thin", "field of view"),
+        ("few bins", "bins"),
+        ("three bins", "bins"),
+        ("not numbers", "bins"),
+    ],
+)
+def test_maps_that_can_show_nothing_are_undecided(kind, why):
+    counts = np.random.default_rng(1).poisson(3.0, (128, 128)).astype(float)
     if kind == "zeros":
         counts *= 0
     elif kind == "one hot bin":
@@ -333,11 +348,22 @@ def test_maps_that_are_none_are_refused(kind):
         counts[:62], counts[66:] = 0, 0
     elif kind == "thin":
         counts = counts[:4]
-    else:
+    elif kind == "few bins":
         counts = counts[:5, :5]
+    elif kind == "three bins":
+        counts = counts[:1, :3]
+    else:
+        counts[:] = np.nan
+        counts[60:64, 60:64] = 3.0
     edges = [np.arange(size + 1.0) - size / 2 for size in counts.shape]
-    with pytest.raises(ValueError, match=r"hits|bins|field of view"):
-        ae.index(ae.DetectorMap.from_array(counts, edges[1], edges[0], is_counts=True), "W")
+    found = ae.index(ae.DetectorMap.from_array(counts, edges[1], edges[0], is_counts=True), "W")
+    assert found.verdict == "undecided" and found.candidates == () and why in found.reason
+    assert found.reason in str(found) and found.to_dict()["candidates"] == [] and found.deciding_marks == ()
+    assert "0 candidates" in repr(found)
+    with pytest.raises(ValueError, match="candidate to draw.*" + why):
+        ae.plot.indexing(found)
+    with pytest.raises(ValueError, match="no orientation: .*" + why):
+        _ = found.best
 
 
 def test_marks_outside_the_map_and_of_no_pole_are_refused():

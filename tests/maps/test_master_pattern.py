@@ -9,16 +9,11 @@ from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
 
 
 @pytest.fixture(scope="module")
-def run(made_once):
-    def make():
-        nickel = ae.material("Ni")
-        tip = ae.Tip(nickel, 9 * nickel.a, axis=(0.36, 0.52, 0.775), shank_length=12 * nickel.a, offset_seed=1)
-        detector = ae.Detector(distance=100.0, width=500.0, projection="equidistant")
-        emissions = [ae.LateralVelocity(0.2), ae.RollUp(0.2), ae.Unperturbed()]
-        simulation = ae.Simulation(tip, seed=1, detector=detector)
-        return simulation.run(3_000, emissions, responses=False, progress=False)
-
-    return made_once("run_for_patterns", make)
+def run(nickel, made_once):
+    tip = ae.Tip(nickel, 9 * nickel.a, axis=(0.36, 0.52, 0.775), shank_length=12 * nickel.a, offset_seed=1)
+    detector = ae.Detector(distance=100.0, width=500.0, projection="equidistant")
+    emissions = [ae.LateralVelocity(0.2), ae.RollUp(0.2), ae.Unperturbed()]
+    return made_once(tip, 3_000, emissions, responses=False, seed=1, detector=detector)
 
 
 def random_directions(rng, n):

@@ -30,12 +30,8 @@ FASTER = ae.RollUp(ae.TruncatedNormal(0.3, 0.1))
 def low(made_once):
     """Ni[124], an axis without any symmetry: 16,000 ions."""
     nickel = ae.material("Ni")
-
-    def make():
-        tip = ae.Tip(nickel, apex_radius=16 * nickel.a, axis=(1, 2, 4), shank_length=16 * nickel.a)
-        return ae.Simulation(tip, voltage=1000.0, seed=1, **ROUGH).run(16_000, progress=False)
-
-    return made_once("low", make)
+    tip = ae.Tip(nickel, apex_radius=16 * nickel.a, axis=(1, 2, 4), shank_length=16 * nickel.a)
+    return made_once(tip, 16_000, voltage=1000.0, seed=1, **ROUGH)
 
 
 @pytest.fixture(scope="module")

@@ -32,9 +32,9 @@ def emitter(small_tip):
 
 
 @pytest.fixture(scope="module")
-def run(small_tip):
+def run(small_tip, made_once):
     """250 ions with responses."""
-    return ae.Simulation(small_tip, voltage=1000.0, seed=2).run(250, progress=False)
+    return made_once(small_tip, 250, voltage=1000.0, seed=2)
 
 
 def label_of_bar(ax):

@@ -95,10 +95,9 @@ def twins(nickel, made_once):
 
     def make(seed):
         tip = ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=seed)
-        simulation = ae.Simulation(tip, seed=seed, flight_settings=flight)
-        return simulation.run(4000, [ae.Unperturbed()], responses=False, progress=False)
+        return made_once(tip, 4000, [ae.Unperturbed()], responses=False, seed=seed, flight_settings=flight)
 
-    return [made_once(f"twin{seed}", lambda seed=seed: make(seed)) for seed in (21, 22)]
+    return [make(21), make(22)]
 
 
 def reconstructed(run, nickel, origins=None):

@@ -20,7 +20,7 @@ def simulate(tip, n=400, voltage=1000.0, **options):
 
 @pytest.fixture(scope="module")
 def run(made_once, tip12):
-    return made_once("real_units", lambda: simulate(tip12))
+    return made_once(tip12, 400, voltage=1000.0, seed=3)
 
 
 @pytest.fixture(scope="module")

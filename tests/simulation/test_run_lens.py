@@ -25,8 +25,8 @@ def lens():
 
 
 @pytest.fixture(scope="module")
-def run(tip12):
-    return ae.Simulation(tip12, seed=3, n_threads=1).run(600, progress=False)
+def run(tip12, made_once):
+    return made_once(tip12, 600, seed=3)
 
 
 @pytest.fixture(scope="module")

@@ -362,6 +362,7 @@ def test_ions_roll_onto_nearest_neighbours(element):
     assert np.nanmax(np.abs(distances / material.nearest_neighbour_distance - 1)) < 1e-9
 
 
+@pytest.mark.slow
 def test_evaporation_past_the_point_of_the_potential(nickel):
     # the cap's centre, where the voltage is defined, is an atom of this tip: all of the cap goes
     tip = ae.Tip(nickel, apex_radius=1.0, axis=(1, 1, 1), shank_length=6.0)

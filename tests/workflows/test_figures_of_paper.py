@@ -61,6 +61,16 @@ def test_runs_are_made_once_and_shared(folder):
     assert len(blunt) == round(1200 * (10 / 8) ** 3) and blunt.responses is None  # one depth over the radius
 
 
+@pytest.mark.slow
+def test_lines_of_one_run_are_equally_wide(run20):
+    figure, described = figures_of_paper._figure_7(run20, run20, (20, 30))
+    assert [claim.verdict for claim in described.claims] == [AGREES, AGREES]
+    assert described.numbers["enhanced"]["chi_square"] == 0 and described.numbers["enhanced"]["ratio"] == 1
+    # the rectangles are where the lines are: widths of R = 20 a on a detector at 100 mm
+    assert all(8 < described.numbers[kind]["lines"]["R = 20 a"]["width"] < 18 for kind in ("depleted", "enhanced"))
+    assert len(figure.axes) >= 6
+
+
 def test_the_energies_of_the_paper():
     """0.3 ± 0.0944 eV and 0.200 ± 0.123 eV after the truncation, as the paper says."""
     for case, mean, deviation in ((ALUMINIUM, 0.3, 0.0944), (NICKEL, 0.200, 0.123)):

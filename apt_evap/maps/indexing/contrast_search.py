@@ -23,6 +23,7 @@ more, are not better by themselves.
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -30,20 +31,10 @@ import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.directions import poles, zones
-from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, nearest, sampled
-from apt_evap.maps.indexing.orientation_search import (
-    AZIMUTHS,
-    RINGS,
-    Disc,
-    Start,
-    about_axis,
-    axes_of,
-    distinct_starts,
-    polar_grid,
-)
-from apt_evap.maps.indexing.refine import STRETCH, directions_of
-from apt_evap.specimen.materials import Material
+from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, master_patterns, nearest_pixels, sampled
+from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Disc, Start, polar_grid
+from apt_evap.maps.indexing.refine import LARGEST_STRETCH, STRETCH, directions_of
+from apt_evap.specimen.materials import Material, as_material
 
 NARROW, WIDE = 0.035, 0.12
 """Standard deviations of the Gaussians of the two means [radii of the field of view]."""
@@ -51,8 +42,7 @@ PIECES = 400
 """Independent pieces of a picture: about twice the area of the disc over that of the narrow Gaussian, 4 pi sigma^2."""
 PATTERN, LINES, POLES = 0.6, 1.0, 0.8
 """Standard deviations of the priors of the amplitudes, for terms and picture of a variance of 1."""
-AXIS_STEP, SCALE_STEP = 2.5, 0.07
-"""Steps of the search: of the axes [degrees], and of the logarithm of the scale."""
+_TYPICAL = {"fcc": "Ni", "bcc": "W", "diamond": "Si"}
 _FLOOR = 0.5  # of the median of the local standard deviation: smaller ones are set to this
 _FLAT = 1e-6  # contrast of an image that has none
 _FAMILIES = 5  # of poles
@@ -96,8 +86,9 @@ def local_contrast(
 def _mean(values, mask, sigma):
     """Mean of the pixels that count in a Gaussian of these standard deviations."""
     along = (*np.zeros(values.ndim - 2), *np.broadcast_to(sigma, 2))
-    sums = scipy.ndimage.gaussian_filter(np.where(mask, values, 0.0), along, mode="constant", truncate=3.0)
-    area = scipy.ndimage.gaussian_filter(mask.astype(float), sigma, mode="constant", truncate=3.0)
+    values = np.where(mask, values, values.dtype.type(0)).astype(np.result_type(values, np.float32), copy=False)
+    sums = scipy.ndimage.gaussian_filter(values, along, mode="constant", truncate=3.0)
+    area = scipy.ndimage.gaussian_filter(mask.astype(values.dtype), sigma, mode="constant", truncate=3.0)
     return sums / np.maximum(area, 1e-6)
 
 
@@ -149,7 +140,7 @@ class Terms:
             angles = np.arccos(np.minimum(np.abs(directions @ crystal.normals[spacings == spacing].T).max(axis=-1), 1))
             width = 0.5 * np.sqrt(2 * spacing / (_POLE_RADIUS * material.a))
             images.append(1 - np.exp(-0.5 * (angles / width) ** 2))
-        self._images = np.stack(images)
+        self._images = np.stack(images).astype(np.float32)
         counts = 2 * len(patterns), len(families), len(set(spacings))
         self.priors = np.repeat([PATTERN, LINES, POLES], counts)
         """Standard deviations of the amplitudes, shape (k,)."""
@@ -159,10 +150,17 @@ class Terms:
         """Crystal structure."""
         if self.structure != "hcp":  # those of one triangle, see `equal`
             self._used = (directions[..., 0] >= 0) & (np.diff(directions, axis=-1) >= 0).all(axis=-1)
+        # what is used, with the pixels beside it
+        self._rows, self._columns = (
+            slice(max(0, int(lines[0]) - 1), int(lines[-1]) + 2)
+            for lines in (np.flatnonzero(self._used.any(axis=axis)) for axis in (1, 0))
+        )
+        self.corner = self._rows.start, self._columns.start
+        """First row and column of the filtered terms on the disc of a `MasterPattern`."""
         self._filtered: dict[int, np.ndarray] = {}
 
-    def at(self, directions: Floats, half_angle: float) -> Floats:
-        """Filtered terms at unit vectors of the crystal.
+    def at(self, directions: Floats, half_angle: float) -> tuple[np.ndarray, np.ndarray]:
+        """Filtered terms next to unit vectors of the crystal, shape (k, m), and the pixels of these.
 
         Parameters
         ----------
@@ -173,30 +171,40 @@ class Terms:
 
         Returns
         -------
-        ndarray
-            Shape (k, m).
+        tuple of ndarray
+            The terms, and rows and columns on the disc of a `MasterPattern`, shape (2, m).
         """
-        return nearest(self.images(half_angle), self.equal(directions))
+        row, column = nearest_pixels(self.equal(directions))
+        images = self.images(half_angle)
+        flat = images.reshape(len(images), -1)
+        return flat[:, (row - self.corner[0]) * images.shape[2] + column - self.corner[1]], np.stack([row, column])
 
     def equal(self, directions: Floats) -> Floats:
         """Equal directions; of cubic crystals those next to [001], where the pixels are least distorted."""
         return np.sort(np.abs(directions), axis=1) if self.structure != "hcp" else directions
 
     def images(self, half_angle: float) -> np.ndarray:
-        """Filtered terms on the hemisphere for a field of view of this half angle [rad], shape (k, n, n)."""
+        """Filtered terms for a field of view of this half angle [rad], from the pixel `corner` on, shape (k, n, m)."""
         step = round(float(np.log(half_angle)) / _FILTER_STEP)
         if step not in self._filtered:
             sizes = np.array([NARROW, WIDE]) * np.exp(step * _FILTER_STEP) / PIXEL
             margin = int(np.ceil(6 * sizes[1])) + 2  # two Gaussians of three standard deviations
-            near = tuple(
-                slice(max(0, np.flatnonzero(lines)[0] - margin), np.flatnonzero(lines)[-1] + margin + 1)
-                for lines in (self._used.any(axis=1), self._used.any(axis=0))
-            )
+            near = tuple(slice(max(0, part.start - margin), part.stop + margin) for part in (self._rows, self._columns))
             part = self._images[:, *near], self._inside[near], sizes[0], sizes[1], self._used[near]
-            filtered = np.zeros(self._images.shape, np.float32)
-            filtered[:, *near] = local_contrast(*part)
-            self._filtered[step] = filtered
+            rows, columns = (
+                slice(part.start - whole.start, part.stop - whole.start)
+                for part, whole in zip((self._rows, self._columns), near, strict=True)
+            )
+            self._filtered[step] = np.ascontiguousarray(local_contrast(*part)[:, rows, columns], np.float32)
         return self._filtered[step]
+
+
+@lru_cache(maxsize=8)
+def terms_of(material: Material) -> Terms:
+    """Terms of a crystal with the patterns of the package; all cubic crystals of a structure have the same."""
+    if material.structure in _TYPICAL and material != (typical := as_material(_TYPICAL[material.structure])):
+        return terms_of(typical)
+    return Terms(material, master_patterns(material.structure))
 
 
 def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> Floats:
@@ -242,55 +250,6 @@ def _evidence(ridge, cross, priors, amplitudes):
     return -PIECES * np.log1p(-np.clip(explained, 0, 0.999)) - volume[..., None]
 
 
-def search_contrast(
-    picture: Floats, radius: float, terms: Terms, scales: tuple[float, float], n_max: int
-) -> list[Start]:
-    """Compare the local contrast of a map with all orientations and scales of a crystal.
-
-    Parameters
-    ----------
-    picture : ndarray
-        That of the map, of `picture_of`.
-    radius : float
-        Radius of the field of view [mm].
-    terms : Terms
-        Those of the crystal.
-    scales : tuple of float
-        Smallest and largest scale [mm/rad].
-    n_max : int
-        Largest number of orientations.
-
-    Returns
-    -------
-    list of Start
-        The orientations of the largest evidence, each more than two steps from a better one, the best first.
-    """
-    places, areas = places_of()
-    areas = areas.astype(np.float32)  # half the time
-    spectrum = scipy.fft.rfft((picture.astype(np.float32) * areas).reshape(RINGS, AZIMUTHS), axis=1)
-    group = point_group(terms.structure)
-    proper = group[np.linalg.det(group) > 0]
-    turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, AXIS_STEP)])
-    azimuths = polar_grid(RINGS, AZIMUTHS)[1]
-    steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
-    scored = []
-    for scale in np.geomspace(*scales, steps + 1):
-        local = directions_of(places, radius, scale, 0.0)
-        pictures = terms.at((local @ turns).reshape(-1, 3), radius / scale)
-        pictures = pictures.reshape(len(terms.priors), len(turns), -1).swapaxes(0, 1)
-        pictures -= (pictures @ areas)[..., None]
-        pictures /= np.maximum(np.sqrt(pictures**2 @ areas), 1e-3)[..., None]
-        gram = (pictures * areas) @ pictures.swapaxes(1, 2)
-        spectra = scipy.fft.rfft(pictures.reshape(*pictures.shape[:2], RINGS, AZIMUTHS), axis=3)
-        for mirror in (False, True):
-            products = ((spectra if mirror else spectra.conj()) * spectrum).sum(axis=2)
-            values = evidence(gram, scipy.fft.irfft(products, AZIMUTHS, axis=2), terms.priors, terms.signed)
-            best = values.argmax(axis=1)
-            for turn, column, value in zip(turns, best, values.max(axis=1), strict=True):
-                scored.append((value, scale, turn, mirror, azimuths[column]))
-    return distinct_starts(scored, proper, n_max, AXIS_STEP, SCALE_STEP)
-
-
 class Explained(NamedTuple):
     """An orientation at a maximum of the evidence."""
 
@@ -332,7 +291,7 @@ def refine_contrast(
     def sample(images, geometry):
         turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
         directions = directions_of(places, radius, math.exp(geometry[3]), geometry[4]) @ turn
-        pictures = sampled(images, terms.equal(directions))
+        pictures = sampled(images, terms.equal(directions), terms.corner)
         return pictures - (pictures @ areas)[:, None]
 
     def judged(geometry):
@@ -347,7 +306,7 @@ def refine_contrast(
     geometry = np.array([0.0, 0.0, 0.0, np.clip(math.log(start.scale), *limits), 0.0])
     value, amplitudes, model = judged(geometry)
     for _ in range(_STEPS):
-        image = np.tensordot(amplitudes, terms.images(radius / math.exp(geometry[3])), 1)[None]
+        image = np.tensordot(amplitudes.astype(np.float32), terms.images(radius / math.exp(geometry[3])), 1)[None]
         here = sample(image, geometry)[0]
         slopes = np.stack([(sample(image, geometry + s)[0] - here) / _DIFFERENCE for s in _DIFFERENCE * np.eye(5)])
         left = picture - model
@@ -358,7 +317,7 @@ def refine_contrast(
         step = np.clip(step, -0.05, 0.05)
         for _ in range(3):
             moved = geometry + step
-            moved[3:] = np.clip(moved[3], *limits), np.clip(moved[4], -0.2, 0.2)
+            moved[3:] = np.clip(moved[3], *limits), np.clip(moved[4], -LARGEST_STRETCH, LARGEST_STRETCH)
             new = judged(moved)
             if new[0] > value:
                 break

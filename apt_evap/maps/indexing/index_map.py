@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from apt_evap._common.blas_threads import one_blas_thread
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -18,12 +19,14 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
-from apt_evap.maps.indexing.contrast_search import Terms, search_contrast
+from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
+from apt_evap.maps.indexing.halves_and_surrogates import second_lattice, surrogates_of
+from apt_evap.maps.indexing.joint_search import CONTRAST, COUNTED, JOINT, JointSearch
 from apt_evap.maps.indexing.marked_poles import check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns, mixture
-from apt_evap.maps.indexing.orientation_search import Start, disc_of, search
-from apt_evap.maps.indexing.refine import NO_STRETCH, resolution
+from apt_evap.maps.indexing.orientation_search import Start, UnusableMap, disc_of, flattened_by_rings
+from apt_evap.maps.indexing.refine import resolution
 from apt_evap.maps.indexing.two_criteria import Weighed, angle_between, dispersion_of, view_of, weighed
 from apt_evap.specimen.materials import as_material
 
@@ -35,8 +38,16 @@ DIFFERENT = 6.0
 """Angle between the crystal directions that two results give to the places of a map, its RMS, above which they are
 different results [degrees]: in orientation, or in scale."""
 DECIDED = 20.0
-"""Margin to the next different result above which a map decides, see the notes of `index`. Chosen with measured maps
-of nickel (margin 23) and tungsten (23); tungsten as fcc reaches 22, but as bcc it has the larger weight."""
+"""Evidence over the next best orientation or scale above which a map decides, see the notes of `index`."""
+SECOND_LATTICE = 12.0
+"""Evidence of another orientation in a half of the map above which it may hold a second lattice."""
+ABOVE_SURROGATES = 3.0
+"""Standard deviations above the surrogates of the map from which on a result is a crystal."""
+RIVAL = 20.0
+"""Evidence of another crystal structure over the own one above which the map is undecided; if it is less, and more than
+-RIVAL, the map decides for the structure that was given, and the reason says so."""
+EXCLUDED = 45.0
+"""Evidence below the own one, on the grid of the search, at which another crystal structure is not refined."""
 LEAST_IONS = 4_000
 """Fewest ions with which a map decides, without marks: of 11 decided maps of 1,500 to 4,300 ions 4 were wrong, all
 below 3,100 ions (articles/find_the_poles)."""
@@ -48,7 +59,9 @@ LEAST_COMPRESSION, LARGEST_COMPRESSION = 1.2, 2.2
 """Image compressions between which the scale is searched, if only the flight length is known."""
 SHOWN = 3
 """Largest number of candidates of an undecided map in texts and pictures."""
-_STARTS, _RIVALS = 8, 4  # orientations of both searches that are refined, of the crystal and of other structures
+_STARTS, _TO_THE_END = 8, 5  # orientations by each criterion that are refined quickly, and to the end
+_FEW_STARTS, _FEW_TO_THE_END = 3, 2  # of another crystal structure at first
+_HOPELESS = 80.0  # evidence below the own one of these few, at which no more are refined; more starts gain up to 68
 _TYPICAL = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}  # crystals of the patterns
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
 _MAP_BINS = 128
@@ -78,6 +91,9 @@ class Candidate:
         Standard error of the orientation by noise alone [degrees].
     pattern : MasterPattern
         The mixture of the patterns of all radii that fits best.
+    rim_change : float
+        Relative change of the distance per angle from the centre to the rim of the field of view, by a lens or by the
+        flight: negative for a barrel. The scale of the projection is that at the centre.
     """
 
     orientation: Orientation
@@ -88,6 +104,7 @@ class Candidate:
     contrast: float
     angle_error: float
     pattern: MasterPattern
+    rim_change: float = 0.0
 
     def __repr__(self) -> str:
         return f"<Candidate: {self.orientation.material.name} {self}, score {self.score:.2f}>"
@@ -118,7 +135,8 @@ class Candidate:
             "rotation": round(self.orientation.rotation, 2),
             "scale": projection.scale,
             "centre": list(projection.centre),
-            "compression": projection.compression,
+            "barrel": projection.barrel,
+            "rim_change": self.rim_change,
             "score": self.score,
             "confidence": self.confidence,
             "rolled": self.rolled,
@@ -129,7 +147,8 @@ class Candidate:
 
     def __str__(self):
         axis = " ".join(f"{index:.2f}" for index in self.orientation.axis)
-        return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {self.projection.scale:.1f} mm/rad"
+        scale = f"{self.projection.scale:.1f} mm/rad, {100 * self.rim_change:+.0f} % at the rim"
+        return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {scale}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +160,7 @@ class Indexing:
     map : DetectorMap
         The map.
     candidates : tuple of Candidate
-        Different orientations, or scales of one orientation, the best one first.
+        Different orientations, or scales of one orientation, the best one first; none for a map that cannot show any.
     decided : bool
         Whether the map decides for the first candidate.
     reason : str
@@ -155,7 +174,9 @@ class Indexing:
 
     @property
     def best(self) -> Candidate:
-        """The first candidate."""
+        """The first candidate; a ValueError with the reason if there is none."""
+        if not self.candidates:
+            raise ValueError(f"no orientation: {self.reason}")
         return self.candidates[0]
 
     @property
@@ -188,8 +209,9 @@ class Indexing:
         Returns
         -------
         dict
-            verdict, reason, of each candidate its axis, rotation, scale, centre, compression, score, confidence,
-            rolled, contrast, angle_error and the radius of the pattern, and the sentences of `deciding_marks`.
+            verdict, reason, of each candidate its axis, rotation, scale, centre, barrel, rim_change, score,
+            confidence, rolled, contrast, angle_error and the radius of the pattern, and the sentences of
+            `deciding_marks`.
         """
         return {
             "verdict": self.verdict,
@@ -200,7 +222,8 @@ class Indexing:
 
     def __repr__(self) -> str:
         several = "s" * (len(self.candidates) != 1)
-        return f"<Indexing: {self.verdict}, {len(self.candidates)} candidate{several}, first {self.best}>"
+        first = f", first {self.best}" if self.candidates else ""
+        return f"<Indexing: {self.verdict}, {len(self.candidates)} candidate{several}{first}>"
 
     def __str__(self):
         rows = [f"{self.verdict}: {self.reason}"]
@@ -211,7 +234,7 @@ class Indexing:
     @cached_property
     def deciding_marks(self) -> tuple[str, ...]:
         """Sentences: which marked pole would decide between the first candidates of an undecided map."""
-        if self.decided or self.best.score == 0:
+        if self.decided or not self.candidates or self.best.score == 0:
             return ()
         shown = self.candidates[:SHOWN]
         seen = disc_of(self.map).map  # a map without a mask has corners where nothing can be marked
@@ -263,26 +286,32 @@ def index(
     Raises
     ------
     ValueError
-        If there is no pattern of the structure, an argument is outside its range, a mark is outside the map, or the map
-        has too few bins.
+        If there is no pattern of the structure, an argument is outside its range, or a mark is outside the map.
 
     Notes
     -----
-    A search over all axes, rotations and scales compares the map with a master pattern: the density of hits in every
-    direction of the crystal, simulated, for ions that roll up and for ions that do not. A second search compares local
-    contrast with the patterns, with zone lines that may be bright or dark, and with dark poles: what a person sees. The
-    results of both are refined by two criteria. One is the likelihood of the counts, with free amplitudes of the
-    patterns of all radii and a slow change of the efficiency: twice its logarithm, divided by the variance of the sums
-    of neighbouring residuals of the best model in units of Poisson's, so that a model that leaves structure unexplained
-    decides less. The other one is twice the logarithm of the marginal likelihood of the local contrast. Their sum is
-    the weight of a result.
+    The map is divided by the trimmed mean of every ring about its centre. A search over all axes, rotations and scales
+    compares its counts with master patterns, the simulated densities of hits in every direction of the crystal, for
+    ions that roll up and for ions that do not; and its local contrast with the patterns, with zone lines that may be
+    bright or dark, and with dark poles: what a person sees. The best results are refined by two criteria. One is the
+    likelihood of the counts, with free amplitudes of the patterns of all radii and a slow change of the efficiency:
+    twice its logarithm, divided by the variance of the sums of neighbouring residuals of the best model in units of
+    Poisson's, so that a model that leaves structure unexplained decides less. The other one is twice the logarithm of
+    the marginal likelihood of the local contrast. Their sum is the evidence of a result.
 
-    The map is `decided` if the margin of the first weight to that of the next different result is above 20. Results are
-    different if they give crystal directions to the places of the map that are more than 6 degrees apart (RMS): other
-    orientations, or the same one at another scale. Without marks of a user the map also needs 4,000 ions, and no other
-    crystal structure may have a larger weight. A map of noise has a score of 0. Marks that no orientation explains, or
-    that contradict the map, are named in the reason, and the map is not decided. `Indexing.deciding_marks` says which
-    mark would decide.
+    The map is `decided` if the first result passes four checks. (1) Its evidence is more than 20 above that of the next
+    different result. Results are different if they give crystal directions to the places of the map that are more than
+    6 degrees apart (RMS): other orientations, or the same one at another scale. (2) No half of the map has another
+    orientation with 12 more than the first result, and than no crystal: it may be a second lattice. (3) The map is more
+    than 3 standard deviations above the mean of its surrogates, and above all of them: maps with the same rings and
+    lines at random azimuths. (4) No other crystal structure, searched as hard, has 20 more; one that is within 20 is
+    named, as the result holds only if the specimen is what you say. The map also needs 4,000 ions. With marks of a user
+    only the first check applies. The reason says which check refused, and what would help.
+
+    A map of noise has a score of 0. A map that can show no orientation, such as one without hits, is undecided and has
+    no candidates. Marks that no orientation explains, or that contradict the map, are named in the reason, and the map
+    is not decided. `Indexing.deciding_marks` says which mark would decide. The scale of a candidate is that at the
+    centre; a lens changes it to the rim, and both are printed.
 
     The axis is that at the centre of the field of view. An orientation and its mirror image look the same in crystals
     with mirror planes: a map does not decide its handedness.
@@ -311,54 +340,140 @@ def index(
         check_kind(pattern, "patterns", MasterPattern, "MasterPattern")
         if pattern.structure != material.structure:
             raise ValueError(f"patterns must be of {material.structure}, got {pattern!r}")
-    disc = disc_of(measured)
     marks = marks_of(material, poles, lines)
-    check_places(marks, measured, disc.radius)
-    (low, high), bounds = _scales(disc, scales, distance, start)
-    view = view_of(disc)
-    sigma = resolution(disc, math.sqrt(low * high))
-
-    def results_of(material, patterns, n, starts=(), searched=True):
-        terms = Terms(material, patterns)
-        if searched:
-            starts = [*starts, *search_contrast(view.picture, disc.radius, terms, (low, high), n)]
-        densities = np.concatenate([pattern.smoothed(sigma) for pattern in patterns])
-        return weighed(view, terms, densities, starts, n, bounds, marks)
-
-    if start is None:
-        coarse = patterns[:: max(1, len(patterns) // 2)]  # of every second radius
-        starts = search(disc, coarse, (low, high), _STARTS, marks)
-        if marks:  # which may be wrong
-            starts += search(disc, coarse, (low, high), _RIVALS)
-        results = results_of(material, patterns, _STARTS, starts)
-    else:
-        starts = [Start(_matrix_at(disc.centre, *start), start[1].scale, 0.0)]
-        results = results_of(material, patterns, 1, starts, searched=False)
-    if bounds != (low, high):
-        inside = [item for item in results if bounds[0] * 1.001 < item.fit.scale_at_centre < bounds[1] / 1.001]
-        results = inside or results
-    dispersion = dispersion_of([item.fit for item in results])
-    results.sort(key=lambda item: -item.weight(dispersion))
-    group = point_group(material.structure)
-    different: list[Weighed] = []
-    for item in results:
-        if all(angle_between(item.fit, other.fit, group, disc.radius) > DIFFERENT for other in different):
-            different.append(item)
-    weights = np.array([item.weight(dispersion) for item in different])
     n = check_count(candidates, "candidates", at_least=1)
-    contradiction = contradictory_pair(marks, disc.centre, bounds)
-    contradiction = contradiction or contradictory_marks(marks, different[0].fit.deviations)
-    result = _judged(measured, view, material, patterns, different, weights, n, bounds, bool(marks), contradiction)
-    if start is not None:
-        return replace(result, decided=False, reason="refined from a given orientation, others were not searched")
-    if result.decided and not marks:
-        for structure, element in _TYPICAL.items():
-            if structure != material.structure:
-                rivals = results_of(as_material(element), master_patterns(structure), _RIVALS)
-                if max(item.weight(dispersion) for item in rivals) > weights[0]:
-                    reason = f"a {structure} crystal explains the map better"
-                    return replace(result, decided=False, reason=reason)
+    try:
+        disc = disc_of(measured)
+        view = view_of(flattened_by_rings(disc))
+    except UnusableMap as error:
+        return Indexing(measured, (), False, str(error))
+    check_places(marks, measured, disc.radius)
+    scales, bounds = _scales(disc, scales, distance, start)
+    crystal = _Crystal(view, material, patterns, scales, bounds, marks)
+    with one_blas_thread():
+        if start is None:
+            results = crystal.refined(crystal.starts())
+        else:
+            results = crystal.refined([Start(_matrix_at(disc.centre, *start), start[1].scale, 0.0)])
+        dispersion = dispersion_of([item.fit for item in results])
+        results.sort(key=lambda item: -item.weight(dispersion))
+        group = point_group(material.structure)
+        different: list[Weighed] = []
+        for item in results:
+            if all(angle_between(item.fit, other.fit, group, disc.radius) > DIFFERENT for other in different):
+                different.append(item)
+        weights = np.array([item.weight(dispersion) for item in different])
+        contradiction = contradictory_pair(marks, disc.centre, bounds)
+        contradiction = contradiction or contradictory_marks(marks, different[0].fit.deviations)
+        result = _judged(measured, crystal, different, weights, n, contradiction)
+        if start is not None:
+            return replace(result, decided=False, reason="refined from a given orientation, others were not searched")
+        if result.decided and not marks:
+            return _checked(result, crystal, different[0], dispersion, float(weights[0]))
+        return result
+
+
+class _Crystal:
+    """A crystal to which a map is compared.
+
+    Parameters
+    ----------
+    view : View
+        The map.
+    material : Material
+        The crystal.
+    patterns : sequence of MasterPattern
+        Its patterns.
+    scales, bounds : tuple of float
+        Smallest and largest scale of the search, and of the results [mm/rad].
+    marks : sequence of Mark
+        Marks of a user.
+    """
+
+    def __init__(self, view, material, patterns, scales, bounds, marks=()):
+        self.view, self.material, self.patterns, self.scales, self.bounds = view, material, patterns, scales, bounds
+        self.marks = marks
+        packaged = patterns is master_patterns(material.structure)
+        self.terms = terms_of(material) if packaged else Terms(material, patterns)
+
+    @cached_property
+    def search(self) -> JointSearch:
+        """Comparison with all orientations and scales."""
+        return JointSearch(self.view.disc, self.view.picture, self.terms, self.patterns, self.scales, self.marks)
+
+    @cached_property
+    def densities(self):
+        """Densities of the patterns, smoothed for the bins, shape (k, m, m)."""
+        sigma = resolution(self.view.disc, math.sqrt(self.scales[0] * self.scales[1]))
+        return np.concatenate([pattern.smoothed(sigma) for pattern in self.patterns])
+
+    def starts(self, n: int = _STARTS) -> list[Start]:
+        """Best `n` orientations of the search by every criterion."""
+        found = [start for criterion in (CONTRAST, COUNTED, JOINT) for start in self.search.starts(criterion, n)]
+        if self.marks:  # which may be wrong
+            found += self.search.starts(JOINT, _STARTS, marked=False)
+        return found
+
+    def refined(self, starts: Sequence[Start], n: int = _TO_THE_END) -> list[Weighed]:
+        """Orientations, refined by both criteria; the best `n` by either to the end."""
+        results = weighed(self.view, self.terms, self.densities, starts, n, self.bounds, self.marks)
+        if self.bounds != self.scales:
+            low, high = self.bounds
+            results = [item for item in results if low * 1.001 < item.fit.scale_at_centre < high / 1.001] or results
+        return results
+
+
+def _checked(result, crystal, best, dispersion, weight):
+    """The result of a map that prefers one orientation, if it passes the checks that it can fail, or undecided."""
+    undecided = replace(result, decided=False)
+    second = second_lattice(crystal.view, crystal.terms, best.fit)
+    if second > SECOND_LATTICE:
+        return replace(undecided, reason=(
+            "the map may hold a second lattice: in half of it another orientation has more evidence, by "
+            f"{_floor(second)} (at most {SECOND_LATTICE:g} is allowed); a map of one grain would help"
+        ))  # fmt: skip
+    surrogates = surrogates_of(crystal.view, crystal.search, crystal.terms, crystal.densities, crystal.bounds, best.fit)
+    if surrogates.above or surrogates.deviations <= ABOVE_SURROGATES:
+        return replace(undecided, reason=(
+            "maps with the same rings and lines at random azimuths are explained about as well: this one is "
+            f"{surrogates.deviations:.1f} standard deviations above their mean, {surrogates.above} of "
+            f"{len(surrogates.weights)} are above it (more than {ABOVE_SURROGATES:g}, and none, are needed); more ions "
+            "or a marked pole would help"
+        ))  # fmt: skip
+    excess, structure = _best_rival(crystal, dispersion, weight)
+    if excess > RIVAL:
+        return replace(undecided, reason=f"a {structure} crystal explains the map better, by {_floor(excess)}")
+    if excess > -RIVAL:
+        name = crystal.material.name
+        return replace(result, reason=(
+            f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(abs(excess))} "
+            f"{'more' if excess > 0 else 'less'}"
+        ))  # fmt: skip
     return result
+
+
+def _best_rival(crystal, dispersion, weight):
+    """Largest evidence of another crystal structure over the own one, and this structure."""
+    best = -math.inf, ""
+    for structure, element in _TYPICAL.items():
+        if structure == crystal.material.structure:
+            continue
+        patterns = master_patterns(structure)
+        rival = _Crystal(crystal.view, as_material(element), patterns, crystal.scales, crystal.bounds)
+        if rival.search.largest <= crystal.search.largest - EXCLUDED:
+            continue
+        # as hard as the own structure, unless a few starts show that it is far below
+        for starts, to_the_end in ((_FEW_STARTS, _FEW_TO_THE_END), (_STARTS, _TO_THE_END)):
+            results = rival.refined(rival.starts(starts), to_the_end)
+            excess = max(item.weight(dispersion) for item in results) - weight
+            best = max(best, (excess, structure))
+            if excess < -_HOPELESS:
+                break
+    return best
+
+
+def _floor(number):
+    return f"{math.floor(number):d}"  # 11.6 is not 12
 
 
 def _matrix_at(centre, orientation, projection):
@@ -402,9 +517,10 @@ def _scales(disc, scales, distance, start):
     return bounds, bounds
 
 
-def _judged(measured, view, material, patterns, results, weights, n, bounds, marked, contradiction):
-    """Candidates of the best results, and whether they decide."""
-    disc, bins, _ = view
+def _judged(measured, crystal, results, weights, n, contradiction):
+    """Candidates of the best results, and whether the first one is preferred."""
+    disc, bins, _ = crystal.view
+    material, patterns = crystal.material, crystal.patterns
     fits = [item.fit for item in results]
     structured = bins.structure > LEAST_STRUCTURE * bins.structure_error
     structured = structured or max(fit.gain for fit in fits) >= LEAST_GAIN
@@ -416,7 +532,8 @@ def _judged(measured, view, material, patterns, results, weights, n, bounds, mar
     candidates = tuple(
         Candidate(
             orientation=_orientation(material, fit.matrix, proper),
-            projection=_projection(disc, fit, bounds),
+            projection=_projection(disc, fit, crystal.bounds),
+            rim_change=-fit.stretch,
             score=score,
             confidence=float(confidence),
             rolled=float(fit.amplitudes[1::2].sum() / max(fit.amplitudes.sum(), 1e-9)),
@@ -428,19 +545,21 @@ def _judged(measured, view, material, patterns, results, weights, n, bounds, mar
     )
     margin = float(weights[0] - weights[1]) if len(weights) > 1 else math.inf
     decided = margin > DECIDED
-    floor = f"{np.floor(margin):.0f}"  # 11.6 is not 12
-    numbers = f"(margin {floor}; {DECIDED:g} is needed)"
+    numbers = f"evidence over the next best one {_floor(min(margin, 9999))}; {DECIDED:g} is needed"
     if not structured:
         decided, reason = False, "the map has no structure beyond its noise"
     elif contradiction:
         decided, reason = False, contradiction
-    elif not marked and measured.is_counts and measured.ions < LEAST_IONS:
+    elif not crystal.marks and measured.is_counts and measured.ions < LEAST_IONS:
         decided, reason = False, f"{measured.ions:,} ions are too few to decide: {LEAST_IONS:,} are needed"
     elif decided:
-        reason = f"counts and local contrast fit it better than any other orientation or scale {numbers}"
+        reason = f"counts and local contrast fit it better than any other orientation or scale ({numbers})"
     else:
         several = int(np.count_nonzero(weights > weights[0] - DECIDED))
-        reason = f"{several} orientations or scales explain the map about equally well {numbers}"
+        reason = (
+            f"{several} orientations or scales explain the map about equally well ({numbers}); more ions, bounds of "
+            "the scale or a marked pole would help"
+        )
     return Indexing(measured, candidates, decided, reason)
 
 
@@ -454,9 +573,6 @@ def _orientation(material, matrix, proper):
 
 
 def _projection(disc, refined, bounds):
-    """The projection whose radius has the same first two terms: equidistant, or compressed for a negative stretch."""
-    stretch = refined.stretch
+    """The projection of a fit."""
     scale = float(np.clip(refined.scale_at_centre, *bounds))  # by rounding
-    if stretch > NO_STRETCH:
-        return Projection(scale, disc.centre)
-    return Projection(scale, disc.centre, compression=math.sqrt(-(1 - stretch) / (3 * stretch)) * disc.radius / scale)
+    return Projection(scale, disc.centre, barrel=refined.stretch * (refined.scale / disc.radius) ** 2)

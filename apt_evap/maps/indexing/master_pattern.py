@@ -172,16 +172,28 @@ class MasterPattern:
             return cls(str(file["structure"]), float(file["apex_radius"]), densities, int(file["ions"]))
 
 
-def sampled(densities: Floats, directions: Floats) -> Floats:
-    """Densities on the disc, shape (k, n, n), at unit vectors of shape (m, 3), by linear interpolation, (k, m)."""
-    pixels = pixels_of(directions)
-    return np.stack([scipy.ndimage.map_coordinates(density, pixels, order=1, mode="nearest") for density in densities])
+def sampled(densities: Floats, directions: Floats, corner: tuple[int, int] = (0, 0)) -> Floats:
+    """Densities on the disc, shape (k, n, n), at unit vectors of shape (m, 3), by linear interpolation, (k, m).
+
+    A part of the disc begins at the row and the column of `corner`.
+    """
+    height, width = densities.shape[1:]
+    row, column = pixels_of(directions)
+    row, column = np.clip(row - corner[0], 0, height - 1), np.clip(column - corner[1], 0, width - 1)
+    # the four pixels about a place and their weights are those of all densities
+    top, left = np.minimum(row.astype(np.intp), height - 2), np.minimum(column.astype(np.intp), width - 2)
+    down, right = row - top, column - left
+    first = top * width + left
+    flat = densities.reshape(len(densities), -1)
+    upper = flat[:, first] * (1 - right) + flat[:, first + 1] * right
+    lower = flat[:, first + width] * (1 - right) + flat[:, first + width + 1] * right
+    return upper * (1 - down) + lower * down
 
 
-def nearest(densities: Floats, directions: Floats) -> Floats:
-    """Densities on the disc, shape (k, n, n), at the pixels next to unit vectors of shape (m, 3), (k, m)."""
+def nearest_pixels(directions: Floats) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels next to unit vectors of shape (m, 3)."""
     row, column = np.rint(pixels_of(directions)).astype(np.intp)
-    return densities[:, row, column]
+    return row, column
 
 
 def mixture(patterns: Sequence[MasterPattern], amplitudes: Floats) -> MasterPattern:

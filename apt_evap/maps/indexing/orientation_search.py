@@ -1,12 +1,10 @@
-"""Search of the orientation of a map: its flattened picture against those of a master pattern in all orientations.
+"""Field of view of a map, its polar pictures without slow changes, and orientations that a search steps through.
 
 Pictures are polar: rings about the centre of the field of view. All rotations about the axis are then one Fourier
-transform along the azimuth. Slow changes across the map, such as those of the efficiency of the detector, are removed
-from both: polynomials of degree four. The amplitudes of the two patterns, of ions that roll up and of ions that do not,
-are fitted with every orientation, and are not negative: lines may be bright or dark.
+transform along the azimuth (`joint_search`). Slow changes across the map are removed: first the mean density of every
+ring, as many instruments have a strong change along the radius, then polynomials of degree four.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,30 +14,33 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.marked_poles import Mark, rotations_misfit
-from apt_evap.maps.indexing.master_pattern import MasterPattern, nearest
+from apt_evap.maps.noise import effective_ions
 
 RINGS, AZIMUTHS = 20, 96
 """Points of a polar picture."""
-AXIS_STEP = 3.0
-"""Distance of neighbouring axes in the search [degrees]."""
-SCALE_STEP = 0.08
-"""Step of the search in the logarithm of the scale."""
 SMOOTHED = 1.5
 """Standard deviation of the Gaussian that smooths the patterns [degrees], about the distance to the nearest axis."""
 DEGREE = 4
 """Degree of the polynomials that are removed from maps and patterns."""
-MARK_COST = 0.02
-"""Correlation that a squared standard error of a mark costs in the search."""
 _NARROW = 1 / 40  # radii of the field of view: smoothing of the measured map
 _RIM = 0.04  # radii of the field of view: its rim, where the density rises
 _HITS = 40  # in the area of a Gaussian, 4 pi sigma^2, for a noise of 16 %
 _DARK = 0.3  # of the median density: a rim and corners that are darker are not used
 _LINE = 0.1  # radii of the field of view: dark lines up to twice as wide do not divide it
 _HOT, _HOT_ERRORS = 5, 10  # medians of the neighbours, and standard errors, above which a bin is hot
-_BRIGHTEST = 2.5  # mean densities: brighter points of map and pattern are set to this
+BRIGHTEST = 2.5
+"""Mean densities: brighter points of map and pattern are set to this."""
+_RING = 0.03  # radii of the field of view: width of a ring
+_TRIMMED = 0.1  # part of the darkest and of the brightest bins of a ring that its mean does not contain
+_FEWEST_OF_RING = 8  # bins
+_BETWEEN_RINGS = 1.5  # rings: smoothing of their means
+_MOST_HITS = 1e7  # of densities without noise
+_LARGEST_RATIO = 6.0  # of a bin to the mean of its ring: hot bins of densities
+
+
+class UnusableMap(ValueError):
+    """A map without a field of view that could show an orientation."""
 
 
 class Disc(NamedTuple):
@@ -51,6 +52,8 @@ class Disc(NamedTuple):
     """Centre of the circle [mm]."""
     radius: float
     """Radius [mm]."""
+    hits: float | None = None
+    """Number of hits whose noise the map has, if it is not that of its values."""
 
 
 class Start(NamedTuple):
@@ -67,7 +70,7 @@ class Start(NamedTuple):
 def disc_of(map: DetectorMap) -> Disc:
     """Find the field of view of a map, without its rim and corners of low density, and the largest circle inside it."""
     if not map.values[map.mask].sum() > 0:
-        raise ValueError(f"the map must have hits, got {map!r}")
+        raise UnusableMap(f"the map must have hits, got {map!r}")
     values = map.values if map.is_counts else map.values * (20 / map.values[map.mask].mean())
     mask = map.mask & field_of_view(np.where(map.mask, values, 0))
     map = _without_hot_bins(map)
@@ -81,7 +84,7 @@ def disc_of(map: DetectorMap) -> Disc:
     mask = _distance(mask, map.bin_size) > _RIM * size
     labels, n = scipy.ndimage.label(mask)
     if not n:
-        raise ValueError(f"the map must have a field of view of more than a rim, got {map!r}")
+        raise UnusableMap(f"the map must have a field of view of more than a rim, got {map!r}")
     mask = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
     distance = _distance(mask, map.bin_size)
     # the middle of all bins that are about as far from the rim, as in a rectangle
@@ -120,12 +123,45 @@ def _distance(mask, bin_size):
     return scipy.ndimage.distance_transform_edt(np.pad(mask, 1), sampling=bin_size[::-1])[1:-1, 1:-1]
 
 
+def flattened_by_rings(disc: Disc) -> Disc:
+    """Divide a map by the trimmed mean of every ring about the centre of its disc: no changes along the radius remain.
+
+    The mask and the disc stay those of the map itself, as the rim of a flattened map is as bright as its middle.
+    """
+    map = disc.map
+    try:
+        hits = float(map.values[map.mask].sum()) if map.is_counts else effective_ions(map)
+    except ValueError as error:  # few bins
+        raise UnusableMap(str(error)) from error
+    x, y = np.meshgrid(*map.centres)
+    rings = np.hypot(x - disc.centre[0], y - disc.centre[1]) / (_RING * disc.radius)
+    smooth, area = (scipy.ndimage.gaussian_filter(values, 1.0) for values in (_masked(map), map.mask.astype(float)))
+    values, number = (smooth / np.maximum(area, 1e-3))[map.mask], rings[map.mask].astype(int)
+    means = np.full(number.max() + 1, np.nan)
+    for ring in range(len(means)):
+        inside = np.sort(values[number == ring])
+        if len(inside) >= _FEWEST_OF_RING:
+            trimmed = int(_TRIMMED * len(inside))
+            means[ring] = inside[trimmed : len(inside) - trimmed].mean()
+    known = np.flatnonzero(np.isfinite(means))
+    if not len(known):
+        return disc
+    profile = np.interp(rings, known + 0.5, scipy.ndimage.gaussian_filter(means[known], _BETWEEN_RINGS))
+    ratio = np.clip(_masked(map) / np.maximum(profile, 1e-3 * profile.max()), 0, _LARGEST_RATIO)
+    flat = DetectorMap.from_array(np.where(map.mask, ratio, np.nan), map.x_edges, map.y_edges, map.mask)
+    return disc._replace(map=flat, hits=min(hits, _MOST_HITS))
+
+
+def _masked(map):
+    return np.where(map.mask, map.values, 0.0)
+
+
 def polar_grid(rings: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
     """Radii, shape (rings,), as fractions of the rim, and azimuths [rad]."""
     return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
 
 
-def _slow(radii, azimuths):
+def slow_changes(radii, azimuths):
     """Orthonormal polynomials on the disc, with the areas of the points as weights, (n, k), and these weights (n,)."""
     r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
     x, y = r * np.cos(phi), r * np.sin(phi)
@@ -140,7 +176,7 @@ def flattened(disc: Disc, sigma: float) -> Floats:
     Shape (RINGS, AZIMUTHS).
     """
     radii, azimuths = polar_grid(RINGS, AZIMUTHS)
-    slow, weights = _slow(radii, azimuths)
+    slow, weights = slow_changes(radii, azimuths)
     smoothed = disc.map.smoothed(max(sigma, _NARROW * disc.radius))
     values = np.where(smoothed.mask, smoothed.values, np.nan)
     r, phi = np.meshgrid(radii * disc.radius, azimuths, indexing="ij")
@@ -153,7 +189,7 @@ def flattened(disc: Disc, sigma: float) -> Floats:
     root = np.sqrt(weights)
     # relative to the slow changes, then without them
     background = slow @ (slow.T @ (picture * root)) / root
-    relative = np.clip(picture / np.maximum(background, 0.05 * background.max()), 0, _BRIGHTEST) * root
+    relative = np.clip(picture / np.maximum(background, 0.05 * background.max()), 0, BRIGHTEST) * root
     return (relative - slow @ (slow.T @ relative)).reshape(RINGS, AZIMUTHS)
 
 
@@ -174,73 +210,6 @@ def about_axis(axis: Floats) -> Floats:
     first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(axis, first), axis])
-
-
-def search(
-    disc: Disc,
-    patterns: Sequence[MasterPattern],
-    scales: tuple[float, float],
-    n_max: int,
-    marks: Sequence[Mark] = (),
-) -> list[Start]:
-    """Compare a map with all orientations and scales of some master patterns.
-
-    Parameters
-    ----------
-    disc : Disc
-        The map.
-    patterns : sequence of MasterPattern
-        Patterns of one crystal structure.
-    scales : tuple of float
-        Smallest and largest scale [mm/rad].
-    n_max : int
-        Largest number of results.
-    marks : sequence of Mark
-        Marks of a user. An orientation loses `MARK_COST` of its correlation for each squared standard error.
-
-    Returns
-    -------
-    list of Start
-        The best ones, each more than two steps from a better one.
-    """
-    radii, azimuths = polar_grid(RINGS, AZIMUTHS)
-    slow, weights = _slow(radii, azimuths)
-    root = np.sqrt(weights)
-    group = point_group(patterns[0].structure)
-    proper = group[np.linalg.det(group) > 0]
-    # of an axis and its mirror image the pattern is the same, with the azimuth reversed
-    turns = [about_axis(axis) for axis in axes_of(patterns[0].structure, AXIS_STEP)]
-    steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
-    ring, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
-    smooth = [pattern.smoothed(SMOOTHED) for pattern in patterns]
-    scored = []
-    for scale in np.geomspace(*scales, steps + 1):
-        # smoothed by the same angle as the patterns
-        picture = flattened(disc, np.radians(SMOOTHED) * scale)
-        spectrum, norm = np.fft.rfft(picture, axis=1), np.linalg.norm(picture)
-        theta = ring * (disc.radius / scale)
-        local = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-        marked = [Projection(scale, disc.centre).directions(mark.places) for mark in marks]
-        for turn in turns:
-            cost = np.zeros((2, AZIMUTHS))
-            if marks:
-                for mirror in (False, True):
-                    cost[int(mirror)] = MARK_COST * rotations_misfit(
-                        marks, marked, oriented(turn, mirror, 0.0), azimuths
-                    )
-            for smoothed in smooth:
-                densities = np.minimum(nearest(smoothed, local @ turn), _BRIGHTEST) * root
-                densities -= (densities @ slow) @ slow.T
-                gram = densities @ densities.T
-                spectra = np.fft.rfft(densities.reshape(2, RINGS, AZIMUTHS), axis=2)
-                for mirror in (False, True):
-                    both = spectra if mirror else spectra.conj()
-                    cross = np.fft.irfft((both * spectrum).sum(axis=1), AZIMUTHS, axis=1)
-                    score = _explained(cross, gram)
-                    score = score / norm - cost[int(mirror)]
-                    best = int(np.argmax(score))
-                    scored.append((score[best], scale, turn, mirror, azimuths[best]))
-    return distinct_starts(scored, proper, n_max, AXIS_STEP, SCALE_STEP)
 
 
 def distinct_starts(
@@ -289,14 +258,6 @@ def oriented(turn: Floats, mirror: bool, angle: float) -> Floats:
     about = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     # the mirror image of a crystal with inversion is the crystal turned by 180 degrees about the normal of the mirror
     return about @ (np.diag([1.0, -1.0, 1.0]) @ -turn if mirror else turn)
-
-
-def _explained(cross, gram):
-    """Largest projections onto combinations of two patterns that are not negative, (m,)."""
-    single = cross / np.sqrt(np.maximum(np.diag(gram), 1e-30))[:, None]
-    amplitudes = np.linalg.solve(gram + 1e-9 * np.trace(gram) * np.eye(2), cross)
-    both = np.sqrt(np.maximum((amplitudes * cross).sum(axis=0), 0))
-    return np.where((amplitudes >= 0).all(axis=0), both, single.max(axis=0))
 
 
 def misorientation(first: Floats, second: Floats, rotations: Floats) -> float:

@@ -16,10 +16,10 @@ import numpy as np
 import scipy
 
 from apt_evap._common.types import Floats
-from apt_evap.detection.projection import Projection
+from apt_evap.detection.projection import angle_of
 from apt_evap.maps.indexing.marked_poles import Mark
 from apt_evap.maps.indexing.master_pattern import sampled
-from apt_evap.maps.indexing.orientation_search import DEGREE, Disc
+from apt_evap.maps.indexing.orientation_search import DEGREE, Disc, UnusableMap
 from apt_evap.maps.noise import effective_ions
 
 BINS = 56
@@ -33,10 +33,8 @@ _LONGEST = 3.0  # radii; a square has 1.4
 _FEWEST = 100  # bins, for 15 slow polynomials and 7 numbers of an orientation
 _LEAST = 0.05  # expected counts of a bin at least, where residuals are divided by their error
 _REACH = 5  # bins: residuals farther apart count as independent
-NO_STRETCH = -0.01
-"""Radial stretch above which the projection of the result is equidistant."""
-STRETCH = 0.05
-"""Standard deviation of the prior of the radial stretch at the rim."""
+STRETCH, LARGEST_STRETCH = 0.05, 0.3
+"""Standard deviation of the prior of the radial stretch at the rim, and its bound: from 1/3 on the image is folded."""
 
 
 class Bins(NamedTuple):
@@ -81,7 +79,7 @@ class Refined:
     scale: float
     """[mm/rad], from the centre to the rim of the disc."""
     stretch: float
-    """Radial stretch: angles are (r / scale) (1 + stretch (r^2 / radius^2 - 1))."""
+    """Radial stretch b at the rim, positive for a barrel: r = scale_at_centre t (1 - b (t / t_rim)^2), angle t."""
     amplitudes: np.ndarray
     """Of the densities, shape (k,)."""
     gain: float
@@ -100,12 +98,7 @@ class Refined:
     @property
     def scale_at_centre(self) -> float:
         """Scale of the projection [mm/rad]."""
-        return self.scale / _widened(self.stretch)
-
-
-def _widened(stretch):
-    """Ratio of the scale from the centre to the rim to that at the centre, as in the projection of the result."""
-    return 1.0 - stretch if stretch <= NO_STRETCH else 1.0
+        return self.scale / (1.0 - self.stretch)
 
 
 def resolution(disc: Disc, scale: float) -> float:
@@ -119,7 +112,7 @@ def bins_of(disc: Disc) -> Bins:
     factor = max(1, round(2 * disc.radius / BINS / max(map.bin_size)))
     values = np.where(map.mask, map.values, 0.0)
     if not map.is_counts:
-        hits = effective_ions(map)
+        hits = effective_ions(map) if disc.hits is None else disc.hits
         values = values * (min(hits, 1e7) / values.sum())
     x, y = np.meshgrid(*map.centres)
     ny, nx = (size // factor * factor for size in values.shape)
@@ -132,11 +125,11 @@ def bins_of(disc: Disc) -> Bins:
     places = (places - disc.centre) / disc.radius
     counts = combined(values)[inside]
     if len(counts) < _FEWEST:
-        raise ValueError(
+        raise UnusableMap(
             f"the map must have at least {_FEWEST} bins in its field of view, got {len(counts)} in {map!r}"
         )
     if (longest := float(np.hypot(*places.T).max())) > _LONGEST:
-        raise ValueError(
+        raise UnusableMap(
             f"the field of view must reach at most {_LONGEST:g} radii of its circle, got {longest:.1f} in {map!r}"
         )
     # well-conditioned polynomials
@@ -164,10 +157,12 @@ def pearson(counts: Floats, mu: Floats) -> float:
 
 
 def directions_of(places: Floats, radius: float, scale: float, stretch: float) -> Floats:
-    """Directions in the specimen at places in radii of the disc: theta = r (1 + stretch (r^2 - 1)) / scale."""
-    r = np.hypot(*places.T)
-    theta = (radius / scale) * (1 + stretch * (r * r - 1))
-    return Projection(1.0).directions(places * theta[:, None])
+    """Directions in the specimen at places in radii of the disc, with the stretch of a `Refined`."""
+    x, y = places.T
+    r = np.hypot(x, y)
+    theta = (radius / scale) * angle_of(r * (1 - stretch), None, stretch)
+    across = np.divide(np.sin(theta), r, out=np.full_like(r, radius / scale * (1 - stretch)), where=r > 0)
+    return np.column_stack([x * across, y * across, np.cos(theta)])
 
 
 def _solve(columns, residuals, weights, prior=None):
@@ -236,7 +231,7 @@ class _Likelihood:
 
     def limits(self, stretch: float) -> Floats:
         """Bounds of the logarithm of the scale from the centre to the rim, shape (2,)."""
-        return np.array(self._bounds) + math.log(_widened(stretch))
+        return np.array(self._bounds) + math.log(1.0 - stretch)
 
     def expected(self, state: _State) -> tuple[Floats, Floats]:
         """Expected counts, and the factor in them that comes from the patterns, each of shape (n,)."""
@@ -310,6 +305,7 @@ class _Likelihood:
         if not moving:
             return _State(fit, amplitudes, state.geometry, state.contrasts)
         geometry = state.geometry + np.clip(change[n_moved:], -0.05, 0.05)
+        geometry[4] = np.clip(geometry[4], -LARGEST_STRETCH, LARGEST_STRETCH)
         geometry[3] = np.clip(geometry[3], *self.limits(geometry[4]))
         return _State(fit, amplitudes, geometry, self.contrasts(geometry))
 

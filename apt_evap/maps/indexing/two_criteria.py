@@ -7,6 +7,7 @@ of a result is their sum. The logarithm of the likelihood is divided by the disp
 that leaves structure unexplained decides less.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -16,10 +17,10 @@ from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.contrast_search import Explained, Terms, picture_of, places_of, refine_contrast
 from apt_evap.maps.indexing.marked_poles import Mark
-from apt_evap.maps.indexing.orientation_search import Disc, Start
+from apt_evap.maps.indexing.orientation_search import Disc, Start, misorientation
 from apt_evap.maps.indexing.refine import Bins, Refined, bins_of, directions_of, refine
 
-_SAME = 2.0  # degrees: starts that are nearer are refined once
+_SAME, _SAME_SCALE = 2.0, 0.05  # degrees, logarithm of the scale: starts that are nearer are refined once
 _QUICK, _STEPS = 7, 20  # of the refinements of all starts, and of the best ones
 _EVERY = 7  # of the points of a polar picture: for angles
 
@@ -119,6 +120,7 @@ def weighed(
     def by_contrast(start):
         return refine_contrast(picture, disc.radius, terms, start, bounds)
 
+    starts = _distinct(starts, group)
     likely = [by_likelihood(start, _QUICK) for start in starts]
     seen = [by_contrast(start) for start in starts]
     dispersion = dispersion_of(likely)
@@ -132,8 +134,23 @@ def weighed(
     for start in different:
         fit = by_likelihood(start, _STEPS)
         # each from where the other one is best
-        results.append(Weighed(fit, max(by_contrast(start).evidence, by_contrast(fit).evidence)))
+        evidence = start.evidence if isinstance(start, Explained) else by_contrast(start).evidence
+        results.append(Weighed(fit, max(evidence, by_contrast(fit).evidence)))
     return results
+
+
+def _distinct(starts, group):
+    """Starts that are not nearly the same as an earlier one."""
+    proper = group[np.linalg.det(group) > 0]
+    distinct: list[Start] = []
+    for start in starts:
+        if not any(
+            misorientation(start.matrix, other.matrix, proper) < _SAME
+            and abs(math.log(start.scale / other.scale)) < _SAME_SCALE
+            for other in distinct
+        ):
+            distinct.append(start)
+    return distinct
 
 
 def dispersion_of(fits: Sequence[Refined]) -> float:

@@ -26,23 +26,7 @@ Rows = dict[str, Any]
 
 
 def examples_of(run: Run, point: Point, settings: DatasetSettings, split: str) -> list[dict[str, Rows]]:
-    """Examples of a run: for each emission the columns of all tables.
-
-    Parameters
-    ----------
-    run : Run
-        The run of a point; in real units, or not yet.
-    point : Point
-        The point.
-    settings : DatasetSettings
-        What the examples contain.
-    split : str
-        Part of the data set to which the run belongs.
-
-    Returns
-    -------
-    list of dict
-    """
+    """Examples of a run: for each emission the columns of all tables."""
     real = run.in_real_units()
     orientation = Orientation.known(run.settings["tip"])
     projection = _projection(real) if orientation is not None else None
@@ -177,20 +161,7 @@ def _zone_lines(orientation, projection, real, instrument):
 
 
 def joined(examples: list[dict[str, Rows]], settings: DatasetSettings) -> dict[str, Rows]:
-    """Tables of several examples, with the index of the example in each row.
-
-    Parameters
-    ----------
-    examples : list of dict
-        Results of `examples_of`.
-    settings : DatasetSettings
-        What they contain.
-
-    Returns
-    -------
-    dict
-        Columns by table and name, in the types of their fields.
-    """
+    """Tables of several examples, with the index of the example in each row."""
     tables: dict[str, Rows] = {}
     for name, fields in chosen_tables(settings.fields).items():
         parts = [example.get(name, {}) for example in examples]

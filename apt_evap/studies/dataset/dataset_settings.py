@@ -22,13 +22,7 @@ _PLACES = 64  # entries of the longest choice of which each is checked
 
 
 def read_instrument(table: str | Mapping[str, Any]) -> Instrument:
-    """Instrument from the name of a preset, or from a table of its fields, perhaps with a ``preset`` that they change.
-
-    Raises
-    ------
-    ValueError
-        If the preset or a field is unknown, or a field is outside its range.
-    """
+    """Instrument from the name of a preset, or from a table of its fields, which change a ``preset`` in it."""
     if isinstance(table, str):
         table = {"preset": table}
     table = dict(check_kind(table, "instrument", Mapping, "a table or the name of a preset"))

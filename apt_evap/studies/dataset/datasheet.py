@@ -27,17 +27,7 @@ example.ions["x"], example.ions["site"], example.poles["indices"]
 
 
 def datasheet(content: dict[str, Any]) -> str:
-    """Text of the data sheet in Markdown.
-
-    Parameters
-    ----------
-    content : dict
-        Content of ``dataset.json``.
-
-    Returns
-    -------
-    str
-    """
+    """Text of the data sheet in Markdown."""
     settings, counts = content["dataset"], content["counts"]
     parts = [f"# {content['title']}"]
     if settings["description"]:

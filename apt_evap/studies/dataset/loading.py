@@ -36,17 +36,7 @@ _KEPT = 8  # tables
 
 @dataclass(frozen=True, repr=False)
 class Example:
-    """An example of a data set: what an instrument records of a run for one emission, and the truth.
-
-    Parameters
-    ----------
-    about : dict
-        Its row of the table of the examples; texts in JSON are decoded.
-    ions : dict of str to ndarray
-        Columns of the ions by name.
-    poles, zone_lines, cap : dict of str to ndarray
-        Columns of these tables by name; empty if the data set does not have them.
-    """
+    """An example of a data set: what an instrument records of a run for one emission, and the truth."""
 
     about: dict[str, Any]
     ions: dict[str, NDArray[Any]]
@@ -151,10 +141,6 @@ class DataSet:
 
     Parameters
     ----------
-    folder : Path
-        The folder.
-    content : dict
-        Content of ``dataset.json``.
     shards : tuple of dict
         The files whose examples it contains, of ``content["shards"]``.
     """
@@ -219,36 +205,14 @@ class DataSet:
         )
 
     def split(self, name: str) -> "DataSet":
-        """The examples of one part.
-
-        Parameters
-        ----------
-        name : {"train", "validation", "test"}
-            The part. No specimen is in two of them.
-
-        Returns
-        -------
-        DataSet
-        """
+        """The examples of one part."""
         check_choice(name, "name", SPLITS)
         part = DataSet(self.folder, self.content, tuple(shard for shard in self.shards if shard["split"] == name))
         part._files = self._files  # and what it has compared
         return part
 
     def table(self, name: str = "ions") -> dict[str, Any]:
-        """Complete table of all examples.
-
-        Parameters
-        ----------
-        name : str
-            "examples", "ions", "poles", "zone_lines" or "cap".
-
-        Returns
-        -------
-        dict
-            Columns by name: arrays; texts are arrays of objects. ``example`` is the index of the example in this data
-            set, and ``first_ion`` that of its first ion.
-        """
+        """Complete table of all examples."""
         fields = self.schema[check_choice(name, "name", tuple(self.schema))]
         parts = [self._files.table(shard["name"], name) for shard in self.shards]
         ions = np.cumsum([0, *(shard["ions"] for shard in self.shards)])
@@ -265,31 +229,14 @@ class DataSet:
         return columns
 
     def frame(self, name: str = "ions") -> "pandas.DataFrame":
-        """Complete table as a data frame; needs pandas.
-
-        Parameters
-        ----------
-        name : str
-            As for `table`.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Columns with several values per row become name_0, name_1, ...; units in ``attrs``.
-        """
+        """Complete table as a data frame; needs pandas."""
         columns = {key: values.reshape(len(values), -1) if values.ndim > 2 else values
                    for key, values in self.table(name).items()}  # fmt: skip
         units = {column.name: column.unit for column in self.schema[name] if column.unit}
         return to_dataframe(columns, source=str(self.folder), units=units)
 
     def to_xarray(self) -> "xarray.Dataset":
-        """All tables as one Dataset; needs xarray.
-
-        Returns
-        -------
-        xarray.Dataset
-            Variables by name of table and column, such as ``ions_x``, along ``ions``, ``examples``, ``poles``, ...
-        """
+        """All tables as one Dataset; needs xarray."""
         xarray: Any = optional_import("xarray", "DataSet.to_xarray")
         variables = {}
         for name, fields in self.schema.items():

@@ -68,19 +68,7 @@ class Shard:
 
 @dataclass(frozen=True, repr=False)
 class PlannedSet:
-    """A planned data set; made by `plan_dataset`.
-
-    Parameters
-    ----------
-    study : SweepStudy
-        The study.
-    sweep : Sweep
-        Its planned sweep, which makes the runs.
-    settings : DatasetSettings
-        What the examples contain.
-    shards : tuple of Shard
-        The files, with their runs.
-    """
+    """A planned data set; made by `plan_dataset`."""
 
     study: SweepStudy
     sweep: Sweep

@@ -159,24 +159,7 @@ def is_finished(folder: Path) -> bool:
 
 
 def read_finished(folder: Path, names: Iterable[str] | None = ()) -> dict[str, Any]:
-    """Content of ``dataset.json`` of a finished data set, after a comparison with its checksums.
-
-    Parameters
-    ----------
-    folder : Path
-        The data set.
-    names : iterable of str or None
-        Further files to compare; all for None. ``dataset.json`` has the SHA-256 of those of the examples.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    FileError
-        If the set is not finished, or a file is missing or damaged.
-    """
+    """Content of ``dataset.json`` of a finished data set, after a comparison with its checksums."""
     content = read_about(folder)
     if not is_finished(folder):
         raise FileError(f"{str(folder)!r} is not a finished data set: it has no {SUMS}")

@@ -22,21 +22,7 @@ def file_names(name: str, schema: Schema, suffix: str) -> dict[str, str]:
 
 
 def write_shard(folder: Path, name: str, tables: dict[str, Rows], schema: Schema, suffix: str) -> None:
-    """Write the tables of a shard; each file is complete or absent.
-
-    Parameters
-    ----------
-    folder : Path
-        Where.
-    name : str
-        Name of the shard, such as "train-0000".
-    tables : dict
-        Columns by table and name.
-    schema : dict
-        Fields by table.
-    suffix : {"hdf5", "parquet"}
-        Format.
-    """
+    """Write the tables of a shard; each file is complete or absent."""
     names = file_names(name, schema, suffix)
     if suffix == "hdf5":
         with write_hdf5(folder / names["ions"], _KIND, len(tables["examples"]["ions"])) as file:
@@ -78,27 +64,7 @@ def _arrow_type(field):
 
 
 def read_table(folder: Path, name: str, table: str, schema: Schema, suffix: str, rows: slice = slice(None)) -> Rows:
-    """Read rows of a table of a shard.
-
-    Parameters
-    ----------
-    folder, name, schema, suffix
-        As for `write_shard`.
-    table : str
-        Name of the table.
-    rows : slice
-        Rows to read.
-
-    Returns
-    -------
-    dict
-        Columns by name.
-
-    Raises
-    ------
-    FileError
-        If a file is missing or damaged.
-    """
+    """Read rows of a table of a shard."""
     path = folder / file_names(name, schema, suffix)[table]
     try:
         columns = (_from_hdf5 if suffix == "hdf5" else _from_parquet)(path, table, schema[table], rows)

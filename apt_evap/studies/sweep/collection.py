@@ -165,27 +165,6 @@ def write_maps(
     points. The perturbations are the panels of ``[maps]`` in the base. Further variables: ``x``, ``y`` (centres [mm]),
     ``x_edges``, ``y_edges`` [mm], ``key``, ``perturbation``, ``ions`` and the settings in which the points differ, with
     ``_`` instead of the dots: numbers as numbers, everything else as JSON.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        The sweep.
-    keys : list of str
-        Keys of finished points.
-    path : str or path-like
-        File to write or replace.
-    bins : int, optional
-        As for `collect_sweep`.
-
-    Returns
-    -------
-    dict
-        Maps of the first points: by key, then by the title of the emission.
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read or written.
     """
     configs = [sweep.config_of(key) for key in keys]
     panels = configs[0].maps.panels

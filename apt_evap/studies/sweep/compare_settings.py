@@ -20,21 +20,7 @@ _READING = ("format", "byte_order", "unit")
 
 @dataclass(frozen=True)
 class CompareSettings:
-    """Comparison of all finished runs of a sweep with a measured map.
-
-    Parameters
-    ----------
-    measured : str
-        Measured ions (.epos, ...) or a map (.npz).
-    grid : EnergyGrid
-        Mechanism and energies.
-    settings : FitSettings
-        Bins, smoothing, draws and resamples.
-    reading : dict
-        Parameters of `read`: format, byte_order, unit.
-    select : dict
-        Bounds of columns, as for `Hits.window`.
-    """
+    """Comparison of all finished runs of a sweep with a measured map."""
 
     measured: str
     grid: EnergyGrid
@@ -47,11 +33,6 @@ class CompareSettings:
         """Settings from the table [compare]; a relative name of a file is relative to `folder`.
 
         Its keys are measured, select, those of `EnergyGrid` and `FitSettings`, and format, byte_order and unit.
-
-        Raises
-        ------
-        ValueError
-            If a key is unknown, or a value is wrong.
         """
         kinds = {"grid": EnergyGrid, "settings": FitSettings}
         known = [name for kind in kinds.values() for name in declared(kind)]

@@ -49,19 +49,7 @@ _MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True, repr=False)
 class Sweep:
-    """A planned sweep; made by `plan_sweep` and `open_sweep`.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the sweep.
-    points : tuple of Point
-        The points, in the order of the study file.
-    job : JobSettings
-        How each point is run.
-    compare : CompareSettings or None
-        Comparison with a measured map.
-    """
+    """A planned sweep; made by `plan_sweep` and `open_sweep`."""
 
     folder: Path
     points: tuple[Point, ...]
@@ -127,15 +115,7 @@ class Sweep:
             yield point, self.state(point.key)
 
     def write_table(self, name: str, rows: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write a CSV file of points with their numbers, keys and settings that differ.
-
-        Parameters
-        ----------
-        name : str
-            Name of the file in the folder of the sweep.
-        rows : mapping of str to mapping
-            Further columns of each point, by its key; all have the same ones.
-        """
+        """Write a CSV file of points with their numbers, keys and settings that differ."""
         text, numbers = io.StringIO(), {key: number for number, key in enumerate(self.by_key)}
         table = csv.writer(text, lineterminator="\n")
         table.writerow(["point", "key", *self.paths, *next(iter(rows.values()))])
@@ -278,23 +258,7 @@ def csv_value(value: Any) -> str:
 
 
 def retry(sweep: Sweep) -> int:
-    """Let all failed points wait for another try.
-
-    Parameters
-    ----------
-    sweep : Sweep
-        The sweep.
-
-    Returns
-    -------
-    int
-        Number of these points.
-
-    Raises
-    ------
-    FileError
-        If this cannot be written.
-    """
+    """Let all failed points wait for another try."""
     failed = [point.key for point, state in sweep.states() if state.name == "failed"]
     for key in failed:
         try_again(sweep.folder_of(key))

@@ -37,11 +37,6 @@ class PointState:
 
     Parameters
     ----------
-    name : {"done", "running", "waiting", "failed", "wrong"}
-        "running" if a process works on it; "waiting" also if its run was interrupted and will continue; "wrong" if its
-        run cannot be read or has other settings than the point.
-    message : str
-        Reason, in one sentence.
     seconds : float or None
         Time of all work on the point [s]; None if it is not known, because a process was killed.
     """

@@ -71,13 +71,7 @@ def is_option(value: Any) -> bool:
 
 
 def option_of(value: Any, path: str) -> Option:
-    """Option of a value of a study: a range, a choice, or "random" for an axis.
-
-    Raises
-    ------
-    ValueError
-        If it is none of them, or its bounds are wrong.
-    """
+    """Option of a value of a study: a range, a choice, or "random" for an axis."""
     if value == RANDOM and path == AXIS:
         return Option(2, lambda u: RandomAxis(*u))
     if not is_option(value):
@@ -132,13 +126,6 @@ def _rounded(number, unit):
 def sobol(n: int, width: int, seed: int) -> Floats:
     """First points of a scrambled Sobol' sequence; more points do not change the first ones.
 
-    Parameters
-    ----------
-    n, width : int
-        Number of points and of coordinates.
-    seed : int
-        Seed of the scrambling.
-
     Returns
     -------
     ndarray
@@ -159,21 +146,7 @@ def seed_of(*words: Any) -> int:
 
 
 def samples(options: Mapping[str, Option], n: int, seed: int) -> list[dict[str, Any]]:
-    """Values by path of each sample, and its seeds.
-
-    Parameters
-    ----------
-    options : mapping of str to Option
-        What is sampled, by path. Their order gives the coordinates of the Sobol' points.
-    n : int
-        Number of samples.
-    seed : int
-        Seed of the study.
-
-    Returns
-    -------
-    list of dict
-    """
+    """Values by path of each sample, and its seeds."""
     points = sobol(n, sum(option.width for option in options.values()), seed)
     sampled = []
     for number, coordinates in enumerate(points.tolist()):
@@ -186,21 +159,7 @@ def samples(options: Mapping[str, Option], n: int, seed: int) -> list[dict[str, 
 
 
 def drawn(thing: Any, random: np.random.Generator, name: str) -> Any:
-    """A table or list with a drawn value in the place of each range or choice in it.
-
-    Parameters
-    ----------
-    thing : object
-        Plain types.
-    random : numpy.random.Generator
-        Random numbers.
-    name : str
-        What it is, for messages.
-
-    Returns
-    -------
-    object
-    """
+    """A table or list with a drawn value in the place of each range or choice in it."""
     if is_option(thing):
         option = option_of(thing, name)
         return option.value(random.random(option.width).tolist())

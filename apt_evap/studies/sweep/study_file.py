@@ -45,15 +45,8 @@ class Point:
 
     Parameters
     ----------
-    key : str
-        First 12 digits of the SHA-256 of the complete settings, see `key_of`.
     values : dict
         Settings in which this point differs from the base: values by path, such as ``{"tip.axis": [1, 1, 1]}``.
-    document : dict
-        Complete settings, as in a file of `apt-evap run`. The file of a specimen is relative to the folder of the
-        point, and has its SHA-256.
-    estimate : CostEstimate
-        Its cost.
     """
 
     key: str
@@ -76,20 +69,6 @@ class SweepStudy:
 
     Parameters
     ----------
-    path : Path
-        The study file.
-    base : Path
-        File with the common settings.
-    points : tuple of Point
-        All points, each once.
-    configs : tuple of Config
-        Their settings, validated.
-    job : JobSettings
-        How each point is run.
-    compare : CompareSettings or None
-        Comparison with a measured map.
-    sha256 : str
-        Of the bytes of both files, and of the files of specimens.
     dataset : dict
         The table ``[dataset]``, for `studies.make_dataset`.
     """
@@ -105,13 +84,7 @@ class SweepStudy:
 
 
 def folder_of_study(path: AnyPath) -> Path:
-    """Folder of the sweep of a study file: beside it, with its name without suffix; a folder is returned as it is.
-
-    Raises
-    ------
-    FileError
-        If it is neither.
-    """
+    """Folder of the sweep of a study file: beside it, with its name without suffix; a folder is returned as it is."""
     path = check_path(path)
     if not path.is_dir() and not path.suffix:
         raise FileError(f"{str(path)!r} is neither a study file such as 'study.toml' nor the folder of a sweep")
@@ -130,20 +103,6 @@ def read_study(path: AnyPath) -> SweepStudy:
     [1e-3, 0.1] }``, ``{ integer = [1, 6] }``, ``{ choice = ["Ni", "Al"] }``, and "random" for the axis. Samples are
     Sobol' points, scrambled by ``seed``, and have seeds of their own. Each sample is combined with all combinations of
     the lists.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The study file.
-
-    Returns
-    -------
-    SweepStudy
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read, a key or value is wrong, or the settings of a point are invalid; the message names it.
     """
     path = Path(path)
     table = read_document(path)
@@ -266,26 +225,7 @@ def check_setting_path(path: str) -> None:
 
 
 def with_values(document: dict[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with other values.
-
-    Parameters
-    ----------
-    document : dict
-        Settings, tables in tables.
-    values : mapping
-        Values by path; a missing table is made, a value that is a table replaces the whole one. An entry of a list is
-        named by its number from 0: ``phases.1.region.radius``.
-
-    Returns
-    -------
-    dict
-        A copy.
-
-    Raises
-    ------
-    ValueError
-        If a path leads through a value that is not a table.
-    """
+    """Return settings with other values."""
     document = copy.deepcopy(document)
     for path, value in values.items():
         table, *names = document, *path.split(".")

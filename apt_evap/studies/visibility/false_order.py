@@ -31,19 +31,7 @@ _RESAMPLES = 400  # of the bootstrap: 4 % of an error
 
 @dataclass(frozen=True)
 class FalseOrder:
-    """Warren-Cowley parameters of a random alloy after its evaporation.
-
-    Parameters
-    ----------
-    reconstructed : Estimated
-        Of the reconstructed positions.
-    shuffled : Estimated
-        Mean and standard deviation for labels that are permuted among the same positions.
-    true : Estimated
-        Of the true sites of the same ions.
-    ions, solutes : int
-        Number of ions, and of solutes among them.
-    """
+    """Warren-Cowley parameters of a random alloy after its evaporation."""
 
     reconstructed: Estimated
     shuffled: Estimated

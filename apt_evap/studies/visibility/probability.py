@@ -83,18 +83,12 @@ class Visibility:
     ----------
     size : float
         Size of the feature [nm]; NaN for one without a size.
-    significance : float
-        A feature is found if the p-value is at most this.
     p_values : ndarray
         p-value of each twin of the feature, shape (n,).
     measured, true : dict
         Measured and true values of each twin, each of shape (n,). Lengths in nm, composition as a fraction. Those of
         the analysis have its names. "apparent lateral", "apparent depth", "apparent thickness" and "apparent
         composition" are those of an analysis with the true ions of the feature.
-    sized : SizedTwins or None
-        Twins with different sizes, for N50, N95 and `true_size`.
-    operators : OriginOperators or None
-        The operators; None if all twins are full simulations.
     """
 
     size: float
@@ -140,12 +134,6 @@ class Visibility:
         ----------
         measured : float
             The measured size [nm].
-        name : str, optional
-            Which quantity was measured; by default "size", or else the apparent lateral radius or thickness.
-
-        Returns
-        -------
-        TrueSize
 
         Notes
         -----
@@ -176,12 +164,7 @@ class Visibility:
         return TrueSize(float(median), float(low), float(high))
 
     def to_dict(self) -> dict[str, Any]:
-        """Probability, N50, N95 and errors as numbers, None for NaN, for JSON.
-
-        Returns
-        -------
-        dict
-        """
+        """Probability, N50, N95 and errors as numbers, None for NaN, for JSON."""
         numbers = {"size": self.size, "significance": self.significance, "twins": len(self.p_values)}
         parts = {name: getattr(self, name)._asdict() for name in ("probability", "n50", "n95")}
         parts["errors"] = {name: number._asdict() for name, number in self.errors.items()}
@@ -361,22 +344,10 @@ def permutation_p_value(
 
     Parameters
     ----------
-    analysis : callable
-        As for `estimate`.
     positions : array_like
         Positions [nm], shape (n, 3).
     labels : array_like of int
         Labels, shape (n,).
-    permutations : int
-        Number of permutations.
-    exceedances : int, optional
-        Stop after so many permutations with at least the statistic of the labels; by default never.
-    seed : int or Generator
-        Of the permutations.
-
-    Returns
-    -------
-    float
 
     Examples
     --------

@@ -44,21 +44,6 @@ def recorded_ions(
 ) -> Ions:
     """Reconstruct what an instrument records of a run, with the constants that fit the true sites best.
 
-    Parameters
-    ----------
-    run : Run
-        A run of a tip with a crystalline matrix. Its last phase is the feature, if there are several.
-    instrument : Instrument, optional
-        The instrument; by default one of the efficiency 1 that sees 160 mm at 100 mm.
-    perturbation : perturbation, optional
-        Initial conditions of the ions; by default the first one flown.
-    seed : int
-        Seed of the random numbers of the instrument.
-
-    Returns
-    -------
-    Ions
-
     Examples
     --------
     >>> tip = ae.Tip("Ni", apex_radius=2.5, solutes={"Al": 0.1}, seed=1)
