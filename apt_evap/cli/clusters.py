@@ -19,7 +19,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "example:\n"
         "  apt-evap clusters R5083.pos --ranges R5083.rrng --solute Cu\n"
         "  apt-evap clusters R5083.pos --ranges R5083.rrng --solute Cu,Mg --d-max 0.5 --n-min 20 --envelope 0.5\n"
-        "  apt-evap clusters particle.h5 --solute Cu          true sites of a run, for comparison"
+        "  apt-evap clusters precipitate.h5 --solute Cu          true sites of a run, for comparison"
     )
     add_declared(add_cloud(parser, "clusters"), "measures.clusters", "ClusterSettings", _SETTINGS)
     add_end(parser)

@@ -3,7 +3,7 @@
 import argparse
 
 from apt_evap.cli._options import add_speech
-from apt_evap.cli._output import tell, tell_json
+from apt_evap.cli._output import say, tell, tell_json
 from apt_evap.cli._spectrum_of_file import add_spectrum, spectrum_of
 
 
@@ -35,5 +35,9 @@ def execute(options: argparse.Namespace) -> int:
     if not result.ions and not result.unexplained:
         raise ValueError(f"a composition needs peaks, {options.file!r} has none above the background: {result.hits!r}")
     tell(options, f"{result}")
+    if result.composition.at_percent and result.hits.pulse_id is not None and not result.ranged:
+        losses = result.losses()
+        if losses.matters:
+            say("note", f"{losses}")
     tell_json(options, result.composition.plain())
     return 0

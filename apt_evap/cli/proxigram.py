@@ -20,7 +20,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "example:\n"
         "  apt-evap proxigram R5083.pos --ranges R5083.rrng --solute Cu --isovalue 0.1\n"
-        "  apt-evap proxigram particle.h5 --solute Cu --isovalue 0.25 --largest"
+        "  apt-evap proxigram precipitate.h5 --solute Cu --isovalue 0.25 --largest"
     )
     group = add_cloud(parser, "proxigram")
     group.add_argument("--isovalue", type=float, metavar="X", required=True, help="fraction of the solute, such as 0.1")

@@ -22,6 +22,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "example:\n"
         "  apt-evap spectrum R5083.epos\n"
         "  apt-evap spectrum R5083.epos --element Cr,CrO,Si --save R5083.rrng\n"
+        "  apt-evap spectrum R5083.epos --correlation pairs.png\n"
         "  apt-evap spectrum R5083.epos --ranges R5083.rrng\n"
         "  apt-evap spectrum W_tap.raw --element W --distance 305"
     )
@@ -30,6 +31,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--save", metavar="FILE.rrng", help="save the ranges of the named peaks")
     parser.add_argument(
         "-o", "--output", metavar="PICTURE.png", help=".png, .pdf or .svg; default: FILE_spectrum.png in this folder"
+    )
+    parser.add_argument(
+        "--correlation", metavar="PICTURE.png", help="draw the pairs of ions of one pulse, and print the multiple hits"
     )
     parser.add_argument("--force", action="store_true", help="overwrite FILE.rrng, and a picture not made by apt-evap")
     add_speech(parser)
@@ -45,6 +49,9 @@ def execute(options: argparse.Namespace) -> int:
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_spectrum.png")
     check_output(picture, is_picture, options.force)
+    pairs = None if options.correlation is None else picture_path(options.correlation)
+    if pairs is not None:
+        check_output(pairs, is_picture, options.force)
     saved = None if options.save is None else check_path(options.save)
     if saved is not None and saved.suffix.lower() != ".rrng":
         raise ValueError(f"--save must be a file .rrng, got {options.save!r:.80}")
@@ -66,6 +73,11 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, f"wrote {saved}")
     save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure)
     tell(options, f"wrote {picture}")
+    if pairs is not None:
+        correlation = result.hits.correlation()
+        tell(options, f"{correlation}")
+        save_figure(pairs, plot.correlation(correlation, result).figure)
+        tell(options, f"wrote {pairs}")
     summary = {"wrote": str(picture), "file": options.file, "ranges": None if saved is None else str(saved)}
     names = ("name", "formula", "charge", "ions", "error", "intervals", "others")
     ions = [{name: getattr(ion, name) for name in names} for ion in result.ions]

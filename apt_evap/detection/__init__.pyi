@@ -1,4 +1,6 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
+from .correlation import Correlation as Correlation
+from .correlation import dissociation_line as dissociation_line
 from .hits import Outcome as Outcome
 from .instrument import Detection as Detection
 from .microscope.local_electrode import LocalElectrode as LocalElectrode

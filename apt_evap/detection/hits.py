@@ -23,6 +23,7 @@ from apt_evap._common.validation import (
     without_mask,
 )
 from apt_evap.detection.binning import find_quantisations
+from apt_evap.detection.correlation import Correlation, correlate
 from apt_evap.detection.dataframe import to_dataframe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.distortion import DistortionGrid
@@ -291,6 +292,29 @@ class Hits:
         time, _, x, y = self.require("time_of_flight", "voltage", "x", "y")
         time_zero = check_number(time_zero, "time_zero", unit="ns")
         return replace(self, mass_to_charge=mass_to_charge(self.total_voltage, time - time_zero, x, y, distance))
+
+    def correlation(self) -> Correlation:
+        """Pairs of detected ions of one pulse, and the numbers of pulses with one, two and more ions.
+
+        Returns
+        -------
+        Correlation
+
+        Raises
+        ------
+        ValueError
+            If there is no mass_to_charge or no pulse_id, or there are too many pairs.
+
+        Examples
+        --------
+        >>> hits = ae.Hits(mass_to_charge=[14.0, 28.0, 27.0], pulse_id=[1, 1, 2])
+        >>> hits.correlation()
+        <Correlation: 1 pairs, 66.7% of the ions in pulses with others>
+        """
+        mass, pulse = self.require("mass_to_charge", "pulse_id")
+        with np.errstate(invalid="ignore"):
+            rows = self.detected & (mass > 0) & np.isfinite(mass)
+        return correlate(mass[rows], pulse[rows])
 
     def within_circle(self, radius: float, centre: ArrayLike = (0.0, 0.0)) -> Hits:
         """Select the detected ions within a circle on the detector.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bokeh.events import SelectionGeometry
+from bokeh.events import SelectionGeometry, Tap
 from bokeh.layouts import row
 from bokeh.models import (
     BoxSelectTool,
@@ -104,7 +104,10 @@ class SpectrumPanel:
             LabelSet(x="x", y="y", text="label", text_color="color", source=self.labels, text_font_size="13px",
                      y_offset=2, text_align="center")
         )  # fmt: skip
+        self.unexplained = ColumnDataSource({"x": [], "y": []})
+        self.figure.scatter("x", "y", source=self.unexplained, marker="inverted_triangle", size=9, color="#ff4040")
         self.figure.on_event(SelectionGeometry, self._dragged)
+        self.figure.on_event(Tap, self._clicked)
         self.elements = TextInput(title="ions to name", placeholder="such as W, CrO", width=145)
         self.elements.on_change("value", lambda attr, old, new: self._name_peaks())
         self.distance = NumericInput(
@@ -118,8 +121,10 @@ class SpectrumPanel:
         if self._ions.lacks_distance:
             why = "Masses follow from the times of flight: type the flight length of the instrument."
         self.text = Div(text=why, sizing_mode="stretch_width")
+        self.peak = Div(sizing_mode="stretch_width")
         self.widgets: list[Any] = [
-            row(self.elements, self.distance, self.save, styles={"flex-wrap": "wrap"}), self.figure, self.text,
+            row(self.elements, self.distance, self.save, styles={"flex-wrap": "wrap"}), self.figure, self.peak,
+            self.text,
         ]  # fmt: skip
 
     # ---- the spectrum ----------------------------------------------------------------------------------------------
@@ -150,6 +155,7 @@ class SpectrumPanel:
         self._draw()
         parts = [escape(line) for line in str(named).splitlines()]
         self.text.text = "Drag over peaks to see the map of their ions.<br>" + "<br>".join(parts)
+        self.peak.text = "Click a peak to see which ions it may be."
         formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
         main = main_element(named)
         chosen = self._ions.selection
@@ -198,9 +204,19 @@ class SpectrumPanel:
                 new = {"x": middle, "y": float(inside.max(initial=1)), "label": ion.name, "color": color}
                 labels = {name: [*values, new[name]] for name, values in labels.items()}
         self.ranges.data, self.labels.data = drawn, labels
+        places = np.array([peak.mass for peak in self.named.unexplained])
+        heights = count[np.clip(np.searchsorted(edges, places) - 1, 0, len(count) - 1)]
+        self.unexplained.data = {"x": places, "y": 1.6 * np.maximum(heights, 1)}
         self.figure.visible = True
 
     # ---- the selection ---------------------------------------------------------------------------------------------
+
+    def _clicked(self, event):
+        """Say which ions a peak may be."""
+        if self.named is None or not event.x > 0:
+            return
+        names = self.named.candidates(event.x)
+        self.peak.text = f"{event.x:.4g} Da: {escape(', '.join(names) or 'no ion')}"
 
     def _dragged(self, event):
         box = event.geometry

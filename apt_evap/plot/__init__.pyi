@@ -2,6 +2,7 @@
 from ._figure import new_figure as new_figure
 from .candidates import indexing as indexing
 from .charges import charge_states as charge_states
+from .correlations import correlation as correlation
 from .folds import folded_maps as folded_maps
 from .histories import history as history
 from .histories import voltage_curve as voltage_curve
@@ -10,6 +11,7 @@ from .map_figures import detector_map as detector_map
 from .map_figures import detector_maps as detector_maps
 from .measure_figures import clusters as clusters
 from .measure_figures import composition_profile as composition_profile
+from .measure_figures import truth_comparison as truth_comparison
 from .overlays import overlay as overlay
 from .overlays import score_surface as score_surface
 from .paper_figures import paper_maps as paper_maps

@@ -12,6 +12,7 @@ from apt_evap._common.validation import check_choice, check_kind, check_sequence
 from apt_evap.measures.interface import CompositionProfile
 from apt_evap.measures.point_cloud import Clusters
 from apt_evap.plot._figure import DrawnAxes, new_figure, set_title
+from apt_evap.reconstruction.truth_comparison import TruthComparison
 
 _DOTS = 20_000  # solutes from the side: more hide each other
 _FEWEST = 3  # solutes with a distribution of distances
@@ -96,6 +97,36 @@ def composition_profile(
     ax.legend(fontsize="small")
     set_title(ax, title)
     return ax
+
+
+def truth_comparison(result: TruthComparison, *, title: str | None = None) -> NDArray[np.object_]:
+    """Draw each measure of all sites, of the detected ions and of their reconstructions side by side.
+
+    Parameters
+    ----------
+    result : TruthComparison
+        Result of `reconstruction.compare_with_truth`.
+    title : str, optional
+        Title of the figure.
+
+    Returns
+    -------
+    ndarray of matplotlib.axes.Axes
+        One for each measure.
+    """
+    check_kind(result, "result", TruthComparison, "a TruthComparison, the result of compare_with_truth")
+    figure = new_figure((2.4 + 2.2 * len(result.values), 3.4))
+    axes = figure.subplots(1, len(result.values), squeeze=False)[0]
+    for ax, (name, row) in zip(axes, result.values.items(), strict=True):
+        for place, (value, error) in enumerate(row[cloud] for cloud in result.ions):
+            ax.errorbar(place, value, None if np.isnan(error) else error, fmt="o", color=f"C{place}", capsize=3)
+        ax.axhline(row["all sites"].value, color="0.6", linewidth=0.8)
+        ax.set_xticks(range(len(result.ions)), result.ions, rotation=30, ha="right")
+        ax.set_xlim(-0.5, len(result.ions) - 0.5)
+        set_title(ax, name, fontsize="medium")
+    if title:
+        figure.suptitle(title, parse_math=False)
+    return axes
 
 
 def _side(ax: Axes, result) -> None:

@@ -12,3 +12,5 @@ from .position_errors import position_covariances as position_covariances
 from .precipitate import precipitate_errors as precipitate_errors
 from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
 from .shank import fit_shank as fit_shank
+from .truth_comparison import compare_with_truth as compare_with_truth
+from .truth_comparison import corrected as corrected

@@ -169,7 +169,7 @@ class Explainer:
         return np.array(kept)
 
     def _hydrides(self, choice, chosen, amplitudes):
-        """Hydrides of metals with more ions than the atoms of the metal: they are other ions."""
+        """Hydrides and nitrides with more ions than the atoms of the metal: they are other ions."""
         atomic: dict[str, float] = defaultdict(float)
         ions = [(choice.fit.ions[number], x) for number, x in zip(chosen, amplitudes, strict=True)]
         for ion, x in ions:
@@ -177,9 +177,10 @@ class Explainer:
                 atomic[ion.formula] += x
         hydrides = set()
         for ion, x in ions:
-            if ion is None or len(ion.atoms) != 2 or "H" not in ion.atoms or set(ion.atoms) <= {*GASES, "D"}:
+            metals = [] if ion is None else [name for name in ion.atoms if name not in (*GASES, "D")]
+            if len(metals) != 1 or len(ion.atoms) != 2 or not {"H", "N"} & set(ion.atoms):
                 continue
-            metal = next(name for name in ion.atoms if name != "H")
+            metal = metals[0]
             if x > atomic[metal] and ion.formula not in self.expected:
                 hydrides.add(ion)
         return hydrides

@@ -14,8 +14,11 @@ _NEW_GAS, _NEW_COMMON, _NEW_RARE = 10.0, 25.0, 60.0  # of an element
 _ION = 8.0  # of an ion
 _MOLECULE = 1.5  # of a molecule, for each factor of e by which its atoms are rare
 _RAREST = 0.005  # share of the atoms that counts as that of rarer ones
-_UNUSUAL = 15.0  # of unusual molecules, and of a charge of three or more without the one below
+_UNUSUAL = (
+    15.0  # of unusual molecules, of three atoms of a metal, and of a charge of three or more without the one below
+)
 _NO_ATOMS = 60.0  # of an element without an atomic ion
+_NO_GAS = 20.0  # of H, C, N and O without an atomic ion
 UNNAMED = 40.0
 """Cost of a peak without a name: so no name may cost more, and peaks without a name bring no wrong ions."""
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
@@ -47,7 +50,7 @@ class IonChoice:
         new = [_NEW_GAS if element_of(e) in GASES else _NEW_COMMON if e in COMMON else _NEW_RARE for e in self.elements]
         free = {name for text in expected for name in atoms_of_formula(text)}
         self._new = np.where(np.array([name in free for name in self.elements], bool), 0.0, new)
-        self._no_atoms = np.where(self._gas, 0.0, _NO_ATOMS)
+        self._no_atoms = np.where(self._gas, _NO_GAS, _NO_ATOMS)
         for ion in self._expected_ions:  # the user knows of the molecule
             self._no_atoms[[self._place[name] for name in ion.atoms]] = 0.0
         self.banned: set[str] = set()
@@ -79,7 +82,8 @@ class IonChoice:
             charge[at] = ion.charge
             if sum(counts.values()) == 1:
                 atomic[at] = self._place[next(iter(counts))]
-            unusual[at] = _UNUSUAL * (ion.formula in UNUSUAL)
+            metals = max((number for name, number in counts.items() if name not in (*GASES, "D")), default=0)
+            unusual[at] = _UNUSUAL * (ion.formula in UNUSUAL or metals > 2)
         self.atoms = np.vstack([self.atoms, atoms])
         self._charge = np.concatenate([self._charge, charge]).astype(int)
         self._atomic = np.concatenate([self._atomic, atomic]).astype(int)
@@ -240,7 +244,7 @@ class IonChoice:
         changed = False
         tried = self.candidates(chosen, amplitudes)
         for number in list(chosen):
-            if number not in chosen or self.fit.ions[number] is None:
+            if number not in chosen:
                 continue
             best = None
             for total, other, trial, rest in self.replacements(chosen, number, tried, value):

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_kind, check_number, short_text
 from apt_evap.detection.hits import Hits
+from apt_evap.spectra.candidate_ions import atomic_ions, molecular_ions
 from apt_evap.spectra.composition import MOST_UNEXPLAINED, Amounts, Composition
+from apt_evap.spectra.dead_time import FEWEST_OF_ISOTOPES, DeadTimeLoss, isotope_losses, losses_of
 from apt_evap.spectra.explanation import Explainer, Explanation
 from apt_evap.spectra.flight_fit import FlightFit
 from apt_evap.spectra.flight_search import fitted_flight
-from apt_evap.spectra.ion_names import Abundances, Ion, atoms_of_formula, formula_of_atoms
+from apt_evap.spectra.ion_names import GASES, HIGHEST_CHARGE, Abundances, Ion, atoms_of_formula, formula_of_atoms
 from apt_evap.spectra.ion_profiles import IonProfiles
 from apt_evap.spectra.isotope_comb import in_intervals
 from apt_evap.spectra.mass_calibration import MassCalibration
@@ -30,6 +32,9 @@ FEWEST_OF_ELEMENT = 4000
 FEWEST_OF_COMPOSITION = 200
 """Ions of a spectrum that are enough for a composition."""
 _CLEAR, _UNLIKE, _FEWEST = 5.0, 0.3, 30.0  # unexplained ions: in errors of counting, part of the peak, and number
+_NEAR = 2.0  # errors of the calibration within which an ion may have a peak
+_FREQUENT = 0.1  # abundance over the largest of an isotope that makes a peak
+_CLEAN = 0.98  # part of a peak that one ion has, to measure its isotopes there
 _SHOWN = 8  # unexplained peaks in a text
 _PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
 
@@ -101,6 +106,8 @@ class Spectrum:
         Their peaks.
     source : object
         What explains the peaks: the ions of elements, or those of ranges.
+    abundances : Abundances
+        Isotopes.
     flight : FlightFit or None
         Time zero and flight length of m/n; None if the ions had m/n before.
     refused : str
@@ -125,6 +132,7 @@ class Spectrum:
         hits: Hits,
         peaks: PeakContents,
         source: "_Named | _Ranged",
+        abundances: Abundances,
         flight: FlightFit | None,
         refused: str,
     ) -> None:
@@ -132,7 +140,7 @@ class Spectrum:
         self.ions, self.unexplained, self.unexplained_part = source.named, source.unexplained, source.unexplained_part
         self.misfits: tuple[RangeMisfit, ...] = source.misfits
         self.calibration: MassCalibration = source.calibration
-        self._peaks, self._source = peaks, source
+        self._peaks, self._source, self._abundances = peaks, source, abundances
 
     def __repr__(self) -> str:
         names = ", ".join(ion.name for ion in self.ions) or "no ion named"
@@ -140,7 +148,7 @@ class Spectrum:
 
     def __str__(self) -> str:
         where = ", ".join(map(str, self.unexplained[:_SHOWN])) + (", ..." if len(self.unexplained) > _SHOWN else "")
-        ranged, first = isinstance(self._source, _Ranged), f"unexplained: {self.unexplained_part:.1%} of the ions in "
+        ranged, first = self.ranged, f"unexplained: {self.unexplained_part:.1%} of the ions in "
         lines = [first + ("ranges" if ranged else f"peaks, at {where}" if where else "peaks")]
         lines += [f"range {misfit}" for misfit in self.misfits]
         lines += [f"peaks in no range at {where}"] if ranged and where else []
@@ -151,6 +159,11 @@ class Spectrum:
         if not self.ions and not self.refused:
             lines.append("no ion named: no peaks of known isotopes above the background")
         return "\n".join([*lines, *str(self.composition).splitlines()[1:]])
+
+    @property
+    def ranged(self) -> bool:
+        """Whether the ions are those of ranges."""
+        return isinstance(self._source, _Ranged)
 
     @property
     def either(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
@@ -188,6 +201,68 @@ class Spectrum:
         if number is not None and number < FEWEST_OF_COMPOSITION:
             refused = f"{number:,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
         return amounts.composition(self.unexplained_part, refused)
+
+    def candidates(self, mass: float) -> tuple[str, ...]:
+        """Names of the ions that may have a peak at some m/n [Da], those that the spectrum names first.
+
+        Raises
+        ------
+        ValueError
+            If the m/n is not above zero.
+        """
+        mass = check_number(mass, "mass", above=0, unit="Da")
+        named = [Ion(ion.formula, ion.charge) for ion in self.ions]
+        present = {name for ion in named for name in ion.atoms}
+        tried = [*named, *atomic_ions([*HIGHEST_CHARGE]), *molecular_ions(frozenset(present | {*GASES}), frozenset())]
+        reach = _NEAR * float(self.calibration.shift(mass)[1][0]) + 2 * float(self._peaks.scale.sigma(mass))
+        near = {}
+        for ion in dict.fromkeys(tried):
+            masses, shares = self._abundances.lines(ion.formula)
+            places = self.calibration.place(masses[shares > _FREQUENT * shares.max()] / ion.charge)
+            distance = float(np.abs(np.log(places / mass)).min())
+            if distance < reach:
+                near[ion.name] = ion not in named, ion.charge > 2, distance
+        return tuple(sorted(near, key=lambda name: near[name])[:_SHOWN])
+
+    def dissociations(self) -> list[tuple[str, tuple[float, float, float]]]:
+        """Names and m/n [Da] of the ions that may break into two others, with those of these two."""
+        lines = []
+        known = {(ion.formula, ion.charge): ion for ion in self.ions}
+        for parent in self.ions:
+            for first in self.ions:
+                rest = dict(atoms_of_formula(parent.formula))
+                for name, number in atoms_of_formula(first.formula).items():
+                    rest[name] = rest.get(name, 0) - number
+                if min(rest.values()) < 0 or not any(rest.values()):
+                    continue
+                formula = formula_of_atoms({name: number for name, number in rest.items() if number})
+                second = known.get((formula, parent.charge - first.charge))
+                if second is None or (first.formula, first.charge) > (second.formula, second.charge):
+                    continue
+                ions = (parent, first, second)
+                name = f"{parent.name} → {first.name} + {second.name}"
+                lines.append((name, tuple(self._mass_of(ion) for ion in ions)))
+        return lines  # type: ignore[return-value]
+
+    def _mass_of(self, ion):
+        """m/n of the most abundant isotope of an ion [Da]."""
+        masses, shares = self._abundances.lines(ion.formula)
+        return float(masses[int(np.argmax(shares))]) / ion.charge
+
+    def losses(self) -> DeadTimeLoss:
+        """Losses by dead time: isotopes of single ions against those of pulses with several.
+
+        Raises
+        ------
+        ValueError
+            If the ions have no pulses, or the ions are those of ranges.
+        """
+        if not isinstance(self._source, _Named):
+            raise ValueError("losses need the ions of a spectrum, got those of ranges")
+        (pulse,) = self.hits.require("pulse_id")
+        _, place, number = np.unique(pulse, return_inverse=True, return_counts=True)
+        alone = number[place] == 1
+        return self._source.losses(_detected(self.hits[alone]), _detected(self.hits[~alone]), self.composition)
 
     def background(self, edges: Floats) -> Floats:
         """Number of ions of the background between edges of m/n [Da], shape (k + 1,), array of shape (k,)."""
@@ -261,6 +336,7 @@ class _Named:
             )
         ]
         self.named = tuple(sorted(named, key=lambda ion: -ion.ions))
+        self._peaks, self._formulas = peaks, [ion.name for ion in ions]
         self.amounts = Amounts(
             [ion.atoms for ion in ions],
             explanation.amplitudes,
@@ -280,6 +356,28 @@ class _Named:
     def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
         """Numbers of ions and their covariance among some ions [Da]."""
         return self.profiles.amounts(mass)
+
+    def losses(self, single: Floats, multiple: Floats, before: Composition) -> DeadTimeLoss:
+        """Losses among the ions of pulses with several [Da], from those of pulses with one."""
+        profiles = self.profiles
+        used = np.flatnonzero(profiles.shares.sum(0) > 0)
+        contents = profiles.contents
+        alone = IonProfiles(self._peaks, contents, np.eye(len(contents.mass))[used], contents.ions[used])
+        (first, first_errors), (second, second_errors) = (alone.amounts(mass) for mass in (single, multiple))
+        errors = np.maximum(np.diag(first_errors), 0), np.maximum(np.diag(second_errors), 0)
+        parts = (profiles.shares * profiles.ions[:, None])[:, used]
+        lost, missing = {}, {}
+        for name, part in zip(self._formulas, parts, strict=True):
+            clean = np.flatnonzero(part > _CLEAN * np.maximum(parts.sum(0), 1e-9))
+            if len(clean) < 2:
+                continue
+            major = int(clean[np.argmax(part[clean])])
+            minor = clean[clean != major]
+            if min(first[minor].sum(), second[minor].sum()) < FEWEST_OF_ISOTOPES:
+                continue
+            lost[name] = isotope_losses(major, minor, first, second, errors)
+            missing[name] = second[major] * lost[name][0] / max(1 - lost[name][0], 0.1)
+        return losses_of(self.amounts, self._formulas, lost, missing, before)
 
 
 class _Ranged:
@@ -396,9 +494,9 @@ def spectrum(
     mass = _detected(hits)
     peaks = PeakContents(mass)
     if ranges is not None:
-        return Spectrum(hits, peaks, _Ranged(peaks, ranges, abundances, mass), flight, "")
+        return Spectrum(hits, peaks, _Ranged(peaks, ranges, abundances, mass), abundances, flight, "")
     if formulas is None:
-        return Spectrum(hits, peaks, _Named(peaks, Explainer(peaks, abundances).explain()), flight, "")
+        return Spectrum(hits, peaks, _Named(peaks, Explainer(peaks, abundances).explain()), abundances, flight, "")
     explanation = Explainer(peaks, abundances, formulas, only=True).explain()
     source = _Named(peaks, explanation)
     displaced: dict[str, str] = {}
@@ -407,7 +505,7 @@ def spectrum(
         if displaced:
             rest = [formula for formula in formulas if not set(atoms_of_formula(formula)) & set(displaced)]
             source = _Named(peaks, Explainer(peaks, abundances, rest, only=True).explain())
-    return Spectrum(hits, peaks, source, flight, _refusal(source, explanation, formulas, displaced))
+    return Spectrum(hits, peaks, source, abundances, flight, _refusal(source, explanation, formulas, displaced))
 
 
 def _detected(hits):

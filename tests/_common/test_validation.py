@@ -789,6 +789,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"index", "indexing", "MasterPattern", "master_patterns", "master_pattern"}  # in tests/maps
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
     taken |= {"PointCloud", "CompositionField", "TriangleMesh", "ConvexHull", "label_clusters"}  # in tests/measures
+    taken |= {"compare_with_truth", "corrected", "truth_comparison"}  # in tests/reconstruction
     taken |= {"choose_separation", "nearest_neighbours", "radial_distribution", "short_range_order"}
     taken |= {"interfacial_excess", "ladder_diagram", "read_mesh", "clusters", "composition_profile"}  # and tests/io
     taken |= {"simulate", "compare", "twin", "spectrum", "write_rrng"}  # in tests/studies, tests/cli, tests/detection

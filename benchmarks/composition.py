@@ -1,0 +1,172 @@
+"""Composition of spectra whose truth is known, failures first: the numbers of docs/composition.rst.
+
+    python benchmarks/composition.py [controls] [random] [coverage] [time]
+
+Controls need the package rangefinder (pip install rangefinder); its own composition is printed beside. Costs of the
+choice were set on the random specimens of the seeds 5 and 11; the seeds here are others.
+"""
+
+import sys
+import time
+
+import numpy as np
+
+import apt_evap as ae
+from apt_evap.spectra.ion_names import HIGHEST_CHARGE, Abundances, atoms_of_formula, ion_name
+
+POOL = (
+    "Li B Mg Al Si Ti V Cr Mn Fe Co Ni Cu Zn Ga Ge Y Zr Nb Mo Pd Ag In Sn Sb Gd Hf Ta W Re Pt Au U Ca".split()
+)  # fmt: skip
+# kind, ions, standard deviation of a peak over m/n, length of its tail
+KINDS = (
+    ("alloy", 300_000, 4e-4, 1e-3),
+    ("oxide", 300_000, 4e-4, 1e-3),
+    ("few ions", 30_000, 6e-4, 1.5e-3),
+    ("broad", 300_000, 1.2e-3, 4e-3),
+)
+LINES = Abundances().lines
+
+
+def specimen(rng, kind):
+    """Ions {(formula, charge): share} of two to five elements with one or two charges, and hydrogen."""
+    elements = [str(name) for name in rng.choice(POOL, int(rng.integers(2, 6)), replace=False)]
+    ions = {}
+    for name in elements:
+        highest = HIGHEST_CHARGE[name]
+        charge, share = min(highest, int(rng.integers(1, 4))), float(rng.choice([1, 3, 10, 40]))
+        ions[name, charge] = share
+        other = charge - 1 if charge > 1 else 2
+        if other <= highest:
+            ions[name, other] = share * float(rng.choice([0.02, 0.1, 0.4]))
+    ions["H", 1] = 2.0
+    if kind == "oxide":
+        ions |= {("O", 1): 5.0, ("O2", 1): 3.0}
+        ions |= {(f"{e}O", 1 if rng.random() < 0.6 else 2): float(rng.choice([2, 6])) for e in elements[:2]}
+    return ions
+
+
+def draw(rng, ions, number, width, tail):
+    """m/n of ions with a background of 4 % and a calibration that is wrong by 0.1 %, and by 0.1 % more at low m/n."""
+    lines = [(m / q, share * a) for (formula, q), share in ions.items() for m, a in [LINES(formula)]]
+    masses, shares = np.concatenate([m for m, _ in lines]), np.concatenate([a for _, a in lines])
+    mass = rng.choice(masses, number, p=shares / shares.sum())
+    mass *= 1 + rng.exponential(tail, number) + rng.normal(0, width, number)
+    mass = np.append(mass, (0.7 + 12 * rng.random(round(0.04 * number))) ** 2)
+    first, second = rng.normal(0, 1e-3, 2)
+    return mass * (1 + first + second * np.exp(-mass / 30))
+
+
+def truth(ions):
+    """Composition [at.%]."""
+    atoms = {}
+    for (formula, _), share in ions.items():
+        for element, number in atoms_of_formula(formula).items():
+            atoms[element] = atoms.get(element, 0) + number * share
+    return {element: 100 * number / sum(atoms.values()) for element, number in atoms.items()}
+
+
+def difference(found, expected):
+    """Sum of the absolute differences [at.%]."""
+    return sum(abs(found.get(name, 0) - expected.get(name, 0)) for name in {*found, *expected})
+
+
+def spectrum_of(mass, elements):
+    """The spectrum, and the processor time [s]."""
+    start = time.process_time()
+    result = ae.spectrum(ae.Hits(mass_to_charge=mass), elements)
+    result.composition  # noqa: B018
+    return result, time.process_time() - start
+
+
+def controls(seeds=(20260720, 7)):
+    """Four public synthetic controls, blind and with their elements, beside the composition of rangefinder."""
+    from rangefinder.validation.synthetic import default_validation_materials, synthesize_material_events
+
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        for material in default_validation_materials():
+            mass = synthesize_material_events(material, rng=rng)[3].astype(np.float32)
+            expected = {name: 100 * share for name, share in material.true_atomic_fractions().items()}
+            row = []
+            for elements in (None, list(expected)):
+                result, seconds = spectrum_of(mass, elements)
+                row.append(f"{difference(result.composition.at_percent, expected):.3f} ({seconds:.2f} s)")
+            print(
+                f"{material.name}, seed {seed}, {len(mass):,} ions: L1 blind {row[0]}, elements given {row[1]}",
+                flush=True,
+            )
+
+
+def random(seed=2026, number=25):
+    """Specimens of random elements: distances, invented elements, and what was wrong without a word."""
+    rng = np.random.default_rng(seed)
+    for kind, ions_number, width, tail in KINDS:
+        rows = {True: [], False: []}
+        for _ in range(number):
+            ions = specimen(rng, kind)
+            expected, mass = truth(ions), draw(rng, ions, ions_number, width, tail)
+            for blind in (True, False):
+                result, seconds = spectrum_of(mass, None if blind else sorted(expected))
+                found = result.composition.at_percent
+                invented = sum(value for name, value in found.items() if name not in expected)
+                refused = bool(result.composition.refused)
+                distance = np.nan if refused else difference(found, expected)
+                rows[blind].append((distance, invented, result.unexplained_part, seconds, refused))
+                if refused or distance > 1:
+                    named = {ion.name for ion in result.ions}
+                    missed = ", ".join(sorted({ion_name(*ion) for ion in ions} - named)) or "none"
+                    text = "no composition" if refused else f"L1 {distance:.2f}"
+                    shares = ", ".join(f"{name} {value:.1f}" for name, value in expected.items())
+                    print(f"    {kind}, {'blind' if blind else 'given'}: {text}, invented {invented:.2f} at.%, "
+                          f"not named {missed}, unexplained {result.unexplained_part:.1%}; {shares}")  # fmt: skip
+        for blind, values in rows.items():
+            distance, invented, unexplained, seconds, refused = np.array(values).T
+            silent = int(((distance > 1) & (unexplained < 0.005)).sum())
+            print(
+                f"{kind}, {'blind' if blind else 'given'}: L1 median {np.nanmedian(distance):.2f}, 80 % "
+                f"{np.nanquantile(distance, 0.8):.2f}, largest {np.nanmax(distance):.1f} at.%; {int(refused.sum())} "
+                f"without a composition; invented elements in {int((invented > 0).sum())} of {number}, at most "
+                f"{invented.max():.2f} at.%; {silent} wrong by > 1 with < 0.5 % unexplained; {seconds.mean():.2f} s",
+                flush=True,
+            )
+
+
+def coverage(seed=4052, number=200):
+    """Part of the true shares that lie within one and two standard errors."""
+    rng = np.random.default_rng(seed)
+    pulls = []
+    for at in range(number):
+        kind, ions_number, width, tail = KINDS[at % 2 * 2]
+        ions = specimen(rng, kind)
+        expected = truth(ions)
+        result, _ = spectrum_of(draw(rng, ions, ions_number // (3 if at % 2 else 1), width, tail), sorted(expected))
+        found = result.composition
+        if found.at_percent:
+            # of each specimen one element at random, so that the pulls are independent
+            name = str(rng.choice(sorted(expected)))
+            pulls.append((found.at_percent.get(name, 0) - expected[name]) / max(found.error.get(name, 0), 1e-9))
+    size = np.abs(pulls)
+    print(f"coverage of {len(pulls)} specimens: {np.mean(size < 1):.0%} within one standard error (68 %), "
+          f"{np.mean(size < 1.96):.0%} within 1.96 (95 %); median of the pulls {np.median(pulls):+.2f}")  # fmt: skip
+
+
+def times():
+    """Processor time of a million ions, and of a spectrum with 40 peaks."""
+    rng = np.random.default_rng(3)
+    nickel = {("Ni", 2): 60, ("Ni", 1): 8, ("Al", 2): 8, ("Al", 1): 4, ("Cr", 2): 8, ("Co", 2): 8, ("Ti", 2): 2,
+              ("Ta", 3): 1, ("W", 3): 1, ("Re", 3): 0.5, ("Mo", 3): 0.5, ("Mo", 2): 0.5, ("H", 1): 1}  # fmt: skip
+    calcite = {("Ca", 2): 50, ("CaO", 1): 6, ("Ca2O", 2): 8, ("Ca2CO3", 2): 9, ("C", 1): 5, ("C", 2): 3, ("O2", 1): 3,
+               ("CO2", 1): 2, ("H", 1): 3, ("O", 1): 1, ("CaO2", 1): 2, ("CaOH", 1): 4, ("CO", 1): 6, ("Ca2O2", 2): 3,
+               ("CaCO2", 2): 2, ("CaCO", 2): 2, ("H2O", 1): 1, ("OH", 1): 1, ("Na", 1): 0.7}  # fmt: skip
+    for name, ions in (("nickel alloy", nickel), ("calcite", calcite)):
+        mass = draw(rng, ions, 1_000_000, 4e-4, 1e-3)
+        for elements in (None, sorted(truth(ions))):
+            result, seconds = spectrum_of(mass, elements)
+            print(f"{name}, {len(mass):,} ions, {'blind' if elements is None else 'given'}: {seconds:.2f} s, L1 "
+                  f"{difference(result.composition.at_percent, truth(ions)):.2f}, {result!r}", flush=True)  # fmt: skip
+
+
+if __name__ == "__main__":
+    parts = {"controls": controls, "random": random, "coverage": coverage, "time": times}
+    for part in sys.argv[1:] or parts:
+        parts[part]()
