@@ -8,6 +8,7 @@ and files as `sha256_of`. The next call compares this with what is asked for, by
 import hashlib
 import json
 import math
+import re
 from typing import Any
 
 from apt_evap._common.codec import to_plain
@@ -15,6 +16,7 @@ from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 
+_DIGEST = re.compile(r"'[0-9a-f]{64}'")
 _RELATIVE, _ABSOLUTE = 1e-9, 1e-12  # differences of real numbers that are rounding, such as of sums of lengths
 
 
@@ -27,6 +29,8 @@ def check_made_from(path: AnyPath, kept: Any, asked: Any, remedy: str) -> None:
     """Check that what is kept was made from what is asked for."""
     if difference := first_difference(kept, to_plain(asked)):
         name, before, now = difference
+        if _DIGEST.fullmatch(before) and _DIGEST.fullmatch(now):
+            raise FileError(f"{str(path)!r} was made from another {name}: {remedy}")
         raise FileError(f"{str(path)!r} was made with {name} = {before}, but {now} is asked for: {remedy}")
 
 

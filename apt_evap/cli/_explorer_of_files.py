@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import to_python
-from apt_evap.cli._files import in_real_units, ions_of_map, lens_of, read, read_registration, with_masses
+from apt_evap._common.codec import declared, to_python
+from apt_evap.cli._files import file_of, in_real_units, lens_of, read, read_registration
 from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.config.simulation_file import read_config
@@ -16,12 +16,12 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
-from apt_evap.explore.measured_ions import NUMBERED, IonSelection, MeasuredIons
+from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.start_settings import is_start, registration_start_of
+from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
-from apt_evap.specimen.isotopes import ISOTOPES
 from apt_evap.specimen.materials import MATERIALS
 
 
@@ -31,7 +31,7 @@ def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, 
     if _run_in(path) is not None:
         changes["run"] = path
     else:
-        changes |= dict.fromkeys((*_READING, *_SELECTION, *_OTHERS))
+        changes |= dict.fromkeys((*declared(MeasuredFile), "element"))
         changes |= {"file": path, "time_zero": 0.0, "all_ions": False}
     fresh = argparse.Namespace(**(vars(options) | changes))
     explorer_of_files = explorer_and_view(fresh)
@@ -89,9 +89,8 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
         measured,
         registration,
         run_code="None" if run is None else _run_code(options),
-        measured_code="None" if options.file is None else _measured_code(options),
         run_arguments=[] if run is None else _run_arguments(options),
-        measured_arguments=[] if options.file is None else _measured_arguments(options),
+        file=None if options.file is None else file_of(options),
     )
     if options.element is not None and (name := read_material(options.element, "--element").name) in MATERIALS:
         explorer.crystal = name
@@ -160,15 +159,8 @@ def _measured(options):
         raise ValueError(f"MEASURED must be measured ions or a map, {options.file!r} is a run")
     if isinstance(content, DetectorMap):
         return content
-    # the masses of species are those of the options; others follow the spectrum
     hits = content if content.ion is not None else replace(content, ion=np.arange(len(content)))
-    hits = hits if options.species is None else with_masses(hits, options)
-    fresh = argparse.Namespace(**(vars(options) | {"mass": None, "ions": None}))
-    element = None if options.element is None else read_material(options.element, "--element").name
-    chosen = options.all_ions or options.mass is not None or options.species is not None
-    peaks_of = None if chosen or element not in ISOTOPES else element
-    selection = IonSelection(peaks_of, options.mass, options.ions)
-    return MeasuredIons(ions_of_map(hits, fresh), options.distance, options.time_zero, selection)
+    return MeasuredIons(hits, file=file_of(options))
 
 
 # ---- the same in text ----------------------------------------------------------------------------------------------
@@ -190,56 +182,3 @@ def _run_code(options):
     if options.real_units is not None:
         arguments.append(f"field_reference={options.real_units!r}")
     return f"ae.load({options.run!r})" + (f".at_evaporation_field({', '.join(arguments)})" if arguments else "")
-
-
-_READING = ("format", "byte_order", "voltage_unit", "arrays", "unit")
-_OTHERS = ("ranges", "species", "partial", "circle", "box", "undistort", "distance", "ions", "mass", "element")
-_SELECTION = {"voltage": "voltage"}  # besides what `MeasuredIons` selects
-
-
-def _measured_arguments(options):
-    """Arguments that name MEASURED, its reading and the selection of its ions."""
-    arguments = [options.file]
-    for name in (*_READING, "ranges", "species"):
-        if (value := getattr(options, name)) is not None:
-            arguments += [f"--{name.replace('_', '-')}={value}"]
-    if options.partial:
-        arguments += ["--partial"]
-    for name in _SELECTION:
-        if (value := getattr(options, name)) is not None:
-            arguments += [f"--{name}={','.join('' if bound is None else repr(bound) for bound in value)}"]
-    if options.circle is not None:
-        radius, centre = options.circle
-        arguments += [f"--circle={','.join(map(repr, (radius, *centre)))}"]
-    if options.box is not None:
-        arguments += [f"--box={','.join(map(repr, options.box))}"]
-    return arguments
-
-
-def _measured_code(options):
-    """Python expression that reads MEASURED, without what `MeasuredIons` selects."""
-    if options.file.lower().endswith(".npz") or (options.format or "").lstrip(".").lower() == "npz":
-        names = zip(("values", "x_edges", "y_edges", "mask"), (options.arrays or "").split(","), strict=False)
-        parameters = {name: value for name, value in names if value} | ({"unit": options.unit} if options.unit else {})
-        return f"ae.io.read_map({_call(options.file, parameters)})"
-    parameters = {
-        name: value for name in ("format", "partial", "byte_order", "voltage_unit") if (value := getattr(options, name))
-    } | ({"detector_unit": options.unit} if options.unit else {})
-    code = f"ae.read({_call(options.file, parameters)}){NUMBERED}"
-    if options.species is not None and options.distance is not None:
-        code += f".with_masses({options.distance!r}, {options.time_zero!r})"
-    for name, column in _SELECTION.items():
-        if (bounds := getattr(options, name)) is not None:
-            code += f".window({column}={bounds!r})"
-    if options.circle is not None:
-        code += f".within_circle({options.circle[0]!r}, {options.circle[1]!r})"
-    if options.box is not None:
-        code += f".window(x={options.box[:2]!r}, y={options.box[2:]!r})"
-    if options.species is not None:
-        names = ", ".join(map(repr, options.species.split(",")))
-        code = f"ae.io.read_ranges({options.ranges!r}).select({code}, {names})"
-    return code
-
-
-def _call(path, parameters):
-    return ", ".join([repr(path), *(f"{name}={value!r}" for name, value in parameters.items())])

@@ -7,7 +7,7 @@ from typing import Any
 
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
-from apt_evap.cli._files import in_real_units, ions_of_map, of_element, read, select, selects, with_masses
+from apt_evap.cli._files import file_of, in_real_units, note, read
 from apt_evap.cli._output import say, tell
 from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
@@ -32,7 +32,7 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
         maps, titles = _field_ion_map(content, options)
     elif isinstance(content, Run):
         content = in_real_units(content, options)
-        maps, titles = run_maps(content, _map_settings(content, options), lambda hits: select(hits, options))
+        maps, titles = run_maps(content, _map_settings(content, options), file_of(options).of_run().select)
         titles = [f"{name}{_species(options)}" for name in titles]
     elif options.perturbation or options.real_units or options.lens:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
@@ -44,9 +44,7 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
         sigma = options.smooth if options.smooth is not None else default_smoothing(content) if content.is_counts else 0
         maps, titles = [content.smoothed(sigma)], [Path(options.file).name]
     else:
-        selection = ions_of_map(with_masses(content, options), options)
-        if options.element is not None:
-            selection = of_element(selection, options, content.mass_to_charge is None)
+        selection = file_of(options).ions_of_map(content, note)
         part = f", {len(selection):,} of {len(content):,} ions" if len(selection) < len(content) else ""
         maps = [binned(selection, options.bins, options.smooth)]
         titles = [f"{Path(options.file).name}{_species(options)}{part}"]
@@ -106,7 +104,7 @@ def _field_ion_map(content, options):
     for name in ("perturbation", "real_units", "lens"):
         if getattr(options, name) is not None:
             raise ValueError(f"--field-ion and --{name.replace('_', '-')} exclude each other")
-    if selects(options):
+    if file_of(options).selects:
         raise ValueError("--field-ion shows a surface: it excludes a selection of ions")
     image = field_ion_image(surface_after(content), options.field_ion, detector=content.detector)
     tell(options, f"{image!r}")

@@ -40,7 +40,9 @@ def abundances_of(texts: list[str] | None) -> dict[str, dict[int, float]] | None
 
 def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
     """The spectrum of the ions of FILE that the options select, of all or only of the ions of ranges."""
-    from apt_evap.cli._files import read, select
+    from dataclasses import replace
+
+    from apt_evap.cli._files import file_of, read
     from apt_evap.detection.hits import Hits
     from apt_evap.spectra.mass_spectrum import spectrum
 
@@ -55,5 +57,6 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
         raise ValueError("--element and --ranges name the ions: expected one of them, got both")
     elements = None if options.element is None else options.element.split(",")
     flight = {"distance": options.distance, "time_zero": options.time_zero}
-    chosen = argparse.Namespace(**(vars(options) | {"ranges": None}))  # not for a selection of ions
-    return spectrum(select(hits, chosen), elements, ranges, abundances_of(options.isotope), **flight)
+    # ranges are not for a selection of ions; flight length and time zero are fitted
+    chosen = replace(file_of(options), ranges=None, distance=None)
+    return spectrum(chosen.select(hits), elements, ranges, abundances_of(options.isotope), **flight)

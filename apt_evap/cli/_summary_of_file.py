@@ -11,7 +11,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError
 from apt_evap.analysis.description import UNITS, describe, describe_atoms
-from apt_evap.cli._files import read, select, selects
+from apt_evap.cli._files import file_of, read
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io._texts import without_compression
 from apt_evap.io.formats import RANGE_FORMATS, read_ranges
@@ -32,7 +32,7 @@ def _ranges(options):
     suffix = without_compression(Path(options.file)).suffix.lower() if options.format is None else options.format
     if suffix not in RANGE_FORMATS:
         return None
-    if selects(options):
+    if file_of(options).selects:
         raise FileError(f"{options.file!r} contains ranges of mass: there are no ions to select")
     ranges = read_ranges(options.file, format=options.format)
     spans: dict[str, list[list[float]]] = {}
@@ -48,10 +48,10 @@ def _ranges(options):
 
 def _content(options):
     """Summary of a run, of ions or of a map."""
-    content, summary = read(options), {}
-    if selects(options) and not isinstance(content, DetectorMap):
+    content, summary, file = read(options), {}, file_of(options)
+    if file.selects and not isinstance(content, DetectorMap):
         ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content
-        summary["selected_of"], content = len(ions), select(ions, options)
+        summary["selected_of"], content = len(ions), file.select(ions)
     summary |= describe(content)
     if isinstance(content, Run) and content.ended == StopReason.UNFINISHED:
         summary["kind"] = f"unfinished run of {len(content):,} ions"

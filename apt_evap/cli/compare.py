@@ -102,7 +102,7 @@ def execute(options: argparse.Namespace) -> int:
     with recorded_warnings(() if options.quiet else IN_LINES):
         compare(
             options.run,
-            MeasuredSource(lambda: _measured(options), Path(options.file)),
+            MeasuredSource(lambda _: _measured(options), Path(options.file)),
             options.output or f"{Path(options.file).stem}_study",
             set_by_options(EnergyGrid),
             set_by_options(FitSettings),
@@ -119,7 +119,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _measured(options):
     """Ions or a map of MEASURED; the ions of a run under a perturbation."""
-    from apt_evap.cli._files import ions_of_map, read, select, with_masses
+    from apt_evap.cli._files import file_of, note, read
     from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.detector_map import DetectorMap
     from apt_evap.simulation.run import Run
@@ -128,9 +128,9 @@ def _measured(options):
     if isinstance(content, Run):
         if options.perturbation is None:
             raise ValueError(f"{options.file!r} is a run: its ions need --perturbation")
-        return select(content.hits(read_perturbation(options.perturbation)), options)
+        return file_of(options).of_run().select(content.hits(read_perturbation(options.perturbation)))
     if options.perturbation is not None:
         raise ValueError(f"--perturbation is only for a run as MEASURED, {options.file!r} contains measured ions")
     if isinstance(content, DetectorMap):
         return content
-    return ions_of_map(with_masses(content, options), options)
+    return file_of(options).ions_of_map(content, note)

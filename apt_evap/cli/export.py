@@ -33,14 +33,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap._common.files import FileError, check_path
-    from apt_evap.cli._files import read, select
+    from apt_evap.cli._files import file_of, read
     from apt_evap.io.formats import left_out, write
 
     output = check_path(options.output or f"{Path(options.file).stem}.epos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     content = read(options)
-    hits = select(_ions(content, options), options)
+    hits = file_of(options).select(_ions(content, options))
     detected = hits[hits.detected]
     if not len(detected):
         raise ValueError(f"none of the {len(hits):,} ions of {options.file!r} hit the detector: nothing to write")

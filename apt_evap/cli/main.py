@@ -135,3 +135,7 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
         yield signals
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+if __name__ == "__main__":  # python -m apt_evap.cli.main, as python -m apt_evap.cli
+    sys.exit(main())

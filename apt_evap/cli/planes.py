@@ -42,14 +42,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap._common.validation import check_number
-    from apt_evap.cli._files import read, select
+    from apt_evap.cli._files import file_of, read
     from apt_evap.detection.hits import Hits
     from apt_evap.reconstruction.calibration import find_planes
 
     content = read(options)
     if not isinstance(content, Hits) or content.positions is None:
         raise ValueError(f"planes needs reconstructed ions, {options.file!r} has no positions: reconstruct it first")
-    positions = select(content, options).positions
+    positions = file_of(options).select(content).positions
     at = None if options.at is None else _place(options.at)
     planes, normal, tilt = find_planes(positions, at, radius=options.radius, widest=options.tilt, reach=options.reach)
     result = {

@@ -80,6 +80,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     add_time_zero(constants)
+    parser.add_argument("--peaks", metavar="NAME", help="only the ions in the peaks of this element; default: all ions")
     parser.add_argument("--perturbation", metavar="P", help="of a run, as for map; default: the first one of the run")
     add_real_units(parser)
     add_reading(parser)
@@ -89,10 +90,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
+    from dataclasses import replace
+
     from apt_evap import plot
     from apt_evap._common.codec import for_json
     from apt_evap._common.files import FileError, check_path
-    from apt_evap.cli._files import select, with_masses
+    from apt_evap.cli._files import file_of, note
     from apt_evap.io.formats import read_ranges, write
     from apt_evap.plot.reconstructions import FEWEST
     from apt_evap.reconstruction.assumptions import assumptions
@@ -109,12 +112,12 @@ def execute(options: argparse.Namespace) -> int:
     hits, known = _ions(options)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
-    # ranges without species are for the picture and the solutes
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
-    if ranges is not None and options.species is None:
-        options.ranges = None
+    file = file_of(options)
+    if options.species is None:  # ranges are then for the picture and the solutes
+        file = replace(file, ranges=None)
     origins = None if options.origins is None else OriginTable.load(options.origins)
-    selection = select(with_masses(hits, options), options)
+    selection = file.select(hits, note)
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
     figure = None
     if options.picture is not None or len(reconstruction) >= FEWEST:

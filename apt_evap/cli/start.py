@@ -36,7 +36,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.cli.index import indexed
     from apt_evap.detection.hits import Hits
     from apt_evap.fit.start_settings import is_start, settings_of
-    from apt_evap.workflows.twin_of_map import path_word
+    from apt_evap.io.measured_file import path_word
     from apt_evap.workflows.written_pictures import check_output
 
     path = check_path(options.output or f"{Path(options.file).stem}.toml")

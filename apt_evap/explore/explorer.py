@@ -29,6 +29,7 @@ from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.indexed_registration import index_as_run, indexed_start, register_near
 from apt_evap.fit.measured_map import BINS, measured_map
 from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
+from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.maps.crystallography.directions import poles
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import pole_symmetry
@@ -178,10 +179,12 @@ class Explorer:
         takes up to some minutes.
     preview : int
         Number of ions of a preview; runs of up to this many have no previews.
-    run_code, measured_code : str
-        Python expressions of the run and of the measured ions or map, for `commands`.
-    run_arguments, measured_arguments : sequence of str
+    run_code : str
+        Python expression of the run, for `commands`.
+    run_arguments : sequence of str
         The same as arguments of ``apt-evap``.
+    file : MeasuredFile, optional
+        How the measured ions or the map were read.
 
     Raises
     ------
@@ -197,9 +200,8 @@ class Explorer:
         *,
         preview: int = PREVIEW,
         run_code: str = "run",
-        measured_code: str = "measured",
         run_arguments: Sequence[str] = ("RUN.h5",),
-        measured_arguments: Sequence[str] = ("MEASURED",),
+        file: MeasuredFile | None = None,
     ) -> None:
         if run is None and measured is None:
             raise ValueError("the explorer needs a run, measured ions or a measured map, got none")
@@ -211,12 +213,11 @@ class Explorer:
                 raise ValueError("registration needs a run, and measured ions or a measured map, got only one of them")
         preview = check_count(preview, "preview", at_least=1)
         self.run: Any = run
-        self.ions_of_file = MeasuredIons(measured) if isinstance(measured, Hits) else measured
+        self.ions_of_file = MeasuredIons(measured, file) if isinstance(measured, Hits) else measured
         """All measured ions of the file and the selection of them, a map, or None."""
         self.measured: Any = measured.hits if isinstance(measured, MeasuredIons) else measured
-        self.run_code, self.measured_code = run_code, measured_code
+        self.run_code, self._map_file = run_code, file
         self._run_arguments = [] if run is None else list(run_arguments)
-        self._measured_arguments = [] if measured is None else list(measured_arguments)
         step = 1 if run is None else math.ceil(len(run) / preview)
         self._preview_run: Any = run if run is None or step == 1 else run[::step]
         self._kept_places: list[tuple[Any, Hits]] = []
@@ -270,7 +271,7 @@ class Explorer:
     @property
     def names(self) -> tuple[str, str]:
         """Files of the run and of the measurement, empty without one."""
-        first, second = (names[0] if names else "" for names in (self._run_arguments, self._measured_arguments))
+        first, second = (words[0] if words else "" for words in (self._run_arguments, self._measured_words))
         return first, second
 
     # ---- maps ------------------------------------------------------------------------------------------------------
@@ -775,13 +776,17 @@ class Explorer:
 
     @property
     def _measured_words(self):
-        ions = self.ions_of_file
-        return [*self._measured_arguments, *(ions.arguments if isinstance(ions, MeasuredIons) else [])]
+        if isinstance(self.ions_of_file, MeasuredIons):
+            return self.ions_of_file.arguments
+        if self.measured is None:
+            return []
+        return ["MEASURED"] if self._map_file is None else self._map_file.words()
 
     @property
     def _code_of_measured(self):
-        ions = self.ions_of_file
-        return ions.code(self.measured_code) if isinstance(ions, MeasuredIons) else self.measured_code
+        if isinstance(self.ions_of_file, MeasuredIons):
+            return self.ions_of_file.code
+        return "measured" if self._map_file is None else self._map_file.code(())
 
     def _shell_options(self, settings, command):
         options = [] if self.run is None else ["--perturbation", write_perturbation(settings.perturbation)]

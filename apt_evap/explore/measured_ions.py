@@ -2,19 +2,16 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 from apt_evap.detection.hits import Hits
+from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
-
-NUMBERED = "\0"
-"""Place in the text that reads a file where the rows are those of the file."""
 
 
 @dataclass(frozen=True)
 class IonSelection:
-    """Ions that the maps show.
+    """Ions that the maps show: what the page changes of a `MeasuredFile`.
 
     Parameters
     ----------
@@ -30,10 +27,9 @@ class IonSelection:
     mass: tuple[float | None, float | None] | None = None
     ions: tuple[float | None, float | None] | None = None
 
-    def __post_init__(self):
-        if self.ions is not None:  # whole numbers, also from the text of a command
-            bounds = (bound if bound is None or bound != int(bound) else int(bound) for bound in self.ions)
-            object.__setattr__(self, "ions", tuple(bounds))
+    def of(self, file: MeasuredFile) -> MeasuredFile:
+        """The file with this selection."""
+        return replace(file, peaks=self.element, mass=self.mass, ions=self.ions)
 
 
 class MeasuredIons:
@@ -43,12 +39,9 @@ class MeasuredIons:
     ----------
     hits : Hits
         All ions of the file.
-    distance : float, optional
-        Nominal flight length [mm], for ions with times of flight and no masses.
-    time_zero : float
-        Time that is subtracted from the times of flight [ns].
-    selection : IonSelection
-        What is shown at the start.
+    file : MeasuredFile, optional
+        How they were read, and which of them are shown at the start; by default all. Its flight length and time zero
+        are for ions with times of flight and no masses.
 
     Raises
     ------
@@ -56,15 +49,21 @@ class MeasuredIons:
         If the selection has no ions.
     """
 
-    def __init__(
-        self, hits: Hits, distance: float | None = None, time_zero: float = 0.0, selection: IonSelection | None = None
-    ) -> None:
-        self.all, self.distance, self.time_zero = hits, distance, time_zero
+    def __init__(self, hits: Hits, file: MeasuredFile | None = None) -> None:
+        self.file = MeasuredFile("MEASURED") if file is None else file
+        self._columns, self._start = hits.columns, "measured" if file is None else ""
+        # what the page does not change
+        fixed = IonSelection().of(self.file)
+        self.distance, self.time_zero = self.file.distance, self.file.time_zero
+        if self.file.species is None:  # otherwise their masses are those of the options
+            fixed = replace(fixed, distance=None)
+        self.all = hits if file is None else fixed.ions_of_map(hits)
         self.selection = IonSelection()
-        self.hits = hits
+        self.hits = self.all
         """The ions that are shown."""
-        if selection is not None:
-            self.select(selection)
+        chosen = IonSelection(self.file.peaks, self.file.mass, self.file.ions)
+        if chosen != self.selection:
+            self.select(chosen)
 
     @property
     def number(self) -> int:
@@ -89,7 +88,8 @@ class MeasuredIons:
 
     def spectrum(self, elements: Sequence[str] | None = None) -> Spectrum:
         """Spectrum of all ions; as for `apt_evap.spectrum`."""
-        return spectrum(self.all, elements, **self._flight())
+        distance = self.distance if self._computes else None
+        return spectrum(self.all, elements, distance=distance, time_zero=self.time_zero)
 
     def select(self, selection: IonSelection) -> Hits:
         """Show a part of the ions, and return it.
@@ -99,58 +99,26 @@ class MeasuredIons:
         ValueError
             If masses are not known, or no ions, or too few of the element, remain; the selection is then as before.
         """
-        hits = self.all if selection.ions is None else self.all.window(ion=selection.ions)
-        if selection.element is not None:
-            hits = spectrum(hits, selection.element, **self._flight()).select(selection.element)
-        elif selection.mass is not None:
-            if self._computes:
-                hits = hits.with_masses(self.distance, self.time_zero)  # type: ignore[arg-type]
-            hits = hits.window(mass_to_charge=selection.mass)
-        if not len(hits):
-            raise ValueError(f"no ion of {self.all.source!r} is selected")
+        changed = MeasuredFile(self.file.path, distance=self.distance, time_zero=self.time_zero)
+        hits = selection.of(changed).select(self.all)
         self.selection, self.hits = selection, hits
+        self.file = selection.of(self.file)
         return hits
 
     @property
     def arguments(self) -> list[str]:
-        """Arguments of ``apt-evap`` that select the same ions."""
-        arguments = []
-        if self._computes:
-            arguments += [f"--distance={self.distance!r}"] + ([f"--t0={self.time_zero!r}"] if self.time_zero else [])
-        for name in ("ions", "mass"):
-            if (bounds := getattr(self.selection, name)) is not None:
-                arguments.append(f"--{name}={','.join('' if bound is None else repr(bound) for bound in bounds)}")
-        if self.selection.element is not None:
-            arguments.append(f"--element={self.selection.element}")
-        return arguments
+        """Arguments of ``apt-evap`` that read and select the same ions."""
+        return self.file.words()
 
-    def code(self, code: str) -> str:
-        """Python expression of the same ions, from the one that reads the file.
-
-        The ions of the sequence are selected at `NUMBERED`, before other selections change their numbers.
-        """
-        window = "" if self.selection.ions is None else f".window(ion={self.selection.ions!r})"
-        code = code.replace(NUMBERED, window) if NUMBERED in code else code + window
-        if self.selection.element is not None:
-            words = [
-                code,
-                repr(self.selection.element),
-                *(f"{name}={value!r}" for name, value in self._flight().items()),
-            ]
-            return f"ae.spectrum({', '.join(words)}).select({self.selection.element!r})"
-        if self.selection.mass is not None:
-            if self._computes:
-                code += f".with_masses({self.distance!r}, {self.time_zero!r})"
-            code += f".window(mass_to_charge={self.selection.mass!r})"
-        return code
+    @property
+    def code(self) -> str:
+        """Python expression of the same ions."""
+        return self.file.code(self._columns, self._start)
 
     @property
     def _computes(self):
         """Whether masses follow from the times of flight."""
         return self.all.mass_to_charge is None and self.distance is not None and not self.lacks_times
-
-    def _flight(self) -> dict[str, Any]:
-        return {"distance": self.distance, "time_zero": self.time_zero} if self._computes else {}
 
 
 def main_element(named: Spectrum) -> str | None:

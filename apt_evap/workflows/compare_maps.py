@@ -116,7 +116,7 @@ def compare(
             folder = check_path(folder)
             _check_folder(folder, overwrite)
         source = source_of(measured)
-        content = source.read()
+        content = source.read(note)
         simulated, path = _run_and_file(run)
         simulated.require_responses("run" if path is None else repr(str(path)))
         if registration is None:

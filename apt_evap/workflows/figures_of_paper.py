@@ -587,12 +587,12 @@ def paper(
                 "full is for the figures of twins: the size of the tip of a measured map follows from minutes"
             )
         source = source_of(measured)
-        content = source.read()  # before anything is written
+        content = source.read(note)  # before anything is written
         name = as_material(element if element is not None else "").name
-        _check_folder(folder, {"measured": source.name, "element": name})
+        _check_folder(folder, source.made_from() | {"element": name})
         try:
             made = twin(
-                replace(source, read=lambda: content),
+                replace(source, read=lambda _: content),
                 element,  # type: ignore[arg-type]
                 folder=folder / TWIN,
                 threads=threads,

@@ -8,7 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError, read_small_file, replace_file, sha256_of
+from apt_evap._common.kept import check_made_from
 from apt_evap._common.validation import short_text
 from apt_evap._version import __version__
 
@@ -27,10 +29,9 @@ class KeptFiles:
     ----------
     folder : Path
         The folder; it is made with the first file.
-    files : mapping
-        SHA-256 of the input files by name; None for an option that is not given.
-    options : mapping
-        Values of the options that change a result, in the types of JSON.
+    made_from : mapping
+        What the files are made from, in the types of JSON: SHA-256 of the input files, and values of all options that
+        change a result, by name.
     names : sequence of str
         Names that files and folders of the command may have.
 
@@ -40,12 +41,9 @@ class KeptFiles:
         If the folder cannot be written, has files of other programs with these names, or was made from something else.
     """
 
-    def __init__(
-        self, folder: Path, files: Mapping[str, str | None], options: Mapping[str, Any], names: Sequence[str]
-    ) -> None:
+    def __init__(self, folder: Path, made_from: Mapping[str, Any], names: Sequence[str]) -> None:
         self.folder = folder
-        self._files = files
-        self._made_from = json.loads(json.dumps({**files, **options}))
+        self._made_from = to_plain(made_from)
         self._digests: dict[str, str] = {}
         if os.path.lexists(folder) and not folder.is_dir():
             raise FileError(f"cannot write to {str(folder)!r}: it is not a folder")
@@ -72,16 +70,7 @@ class KeptFiles:
                 raise ValueError(f"made_from and files must be objects, got {short_text(record)}")
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise FileError(f"{str(path)!r} is not a record of this command, {_ELSEWHERE}: {error!r:.80}") from None
-        for name in self._made_from | made_from:
-            now, then = self._made_from.get(name), made_from.get(name)
-            if now != then:
-                if name in self._files:
-                    what = f"from another {name}"
-                else:
-                    option = f"--{name.replace('_', '-')}"  # its name in Python has no dashes
-                    what = f"without {option}" if then is None else f"with {option} {short_text(then)}"
-                    what += "" if now is None else f", not with {short_text(now)}"
-                raise FileError(f"{str(self.folder)!r} was made {what}: {_ELSEWHERE}")
+        check_made_from(self.folder, made_from, self._made_from, _ELSEWHERE)
         self._digests = digests
 
     def _refuse(self, name, why) -> NoReturn:

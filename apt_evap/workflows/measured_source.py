@@ -1,16 +1,16 @@
 """A measurement that is read when it is needed: a file, ions or a map, and what it is made from."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.files import check_path, sha256_of
+from apt_evap._common.files import check_path
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import digest, short_text
+from apt_evap._common.validation import digest
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.simulation.read_file import read
 
 
@@ -21,31 +21,29 @@ class MeasuredSource:
     Parameters
     ----------
     read : callable
-        Reads it, without arguments: Hits or a DetectorMap.
+        Reads it: Hits or a DetectorMap. Takes a function that receives notes.
     path : Path or None
         The file, for reports and names.
-    hashes : callable
-        SHA-256 of the files that it is made from, by name; called by those who need them.
-    options : dict
-        How the files are read and which ions are selected, in plain types by name.
-    words : tuple of str
-        Words of a command line that selects the same ions of the file.
+    file : MeasuredFile or None
+        How the file is read, and which of its ions are used.
     """
 
-    read: Callable[[], Hits | DetectorMap]
+    read: Callable[[Callable[[str], None]], Hits | DetectorMap]
     path: Path | None = None
-    hashes: Callable[[], Mapping[str, str | None]] = dict
-    options: Mapping[str, Any] = field(default_factory=dict)
-    words: tuple[str, ...] = ()
+    file: MeasuredFile | None = None
 
     @property
     def name(self) -> str:
         """Name of the file, or "measured"."""
         return "measured" if self.path is None else self.path.name
 
+    def made_from(self) -> dict[str, Any]:
+        """Record of the file and its options, or of the ions or the map."""
+        return {"FILE": _digest_of(self.read(lambda text: None))} if self.file is None else self.file.made_from()
 
-def source_of(measured: MeasuredSource | Hits | DetectorMap | AnyPath) -> MeasuredSource:
-    """Source of a measurement: of a path, of ions or of a map.
+
+def source_of(measured: MeasuredSource | Hits | DetectorMap | AnyPath, distance: float | None = None) -> MeasuredSource:
+    """Source of a measurement: of a path, with its flight length if masses follow from it, of ions or of a map.
 
     Raises
     ------
@@ -57,17 +55,10 @@ def source_of(measured: MeasuredSource | Hits | DetectorMap | AnyPath) -> Measur
     if isinstance(measured, MeasuredSource):
         return measured
     if isinstance(measured, Hits | DetectorMap):
-        return MeasuredSource(lambda: measured, hashes=lambda: {"FILE": _digest_of(measured)})
+        return MeasuredSource(lambda note: measured)
     path = check_path(measured)
-    return MeasuredSource(partial(_read, path), path, lambda: {"FILE": sha256_of(path)})
-
-
-def _read(path):
-    content = read(path)
-    if not isinstance(content, Hits | DetectorMap):
-        kind = type(content).__name__
-        raise ValueError(f"measured must be ions or a map, {short_text(str(path))} contains a {kind}")
-    return content
+    file = MeasuredFile(str(path), distance=distance)
+    return MeasuredSource(lambda note: file.measured(note, read), path, file)
 
 
 def _digest_of(measured):

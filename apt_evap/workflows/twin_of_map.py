@@ -6,7 +6,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -143,12 +143,13 @@ class _Options:
         return None if self.ranges is None else read_ranges(self.ranges)
 
     def to_plain(self) -> dict[str, Any]:
-        """Plain values of what changes a result, by the names of the options of the command."""
+        """Plain values of what changes a result, by the options of the command."""
         values = {name: getattr(self, name) for name in ("minutes", "field_factor", "distance")}
         values |= {"element": write_material(as_material(self.element))}
         values |= {"efficiency": self.efficiency, "scales": self.scales, "lens": self.electrode}
         values |= {"pole": self.poles or None, "line": self.lines or None}
-        return {name: to_plain(value) for name, value in values.items()}
+        record = {f"--{name.replace('_', '-')}": to_plain(value) for name, value in values.items()}
+        return record | {"file of --ranges": None if self.ranges is None else sha256_of(self.ranges)}
 
 
 class Twin:
@@ -177,17 +178,15 @@ class Twin:
         self.folder = folder
         self._source, self._options, self._threads = source, options, threads
         self._progress, self._note, self._command = progress, note, command
-        ranges = None if options.ranges is None else sha256_of(options.ranges)
-        files = {"FILE": None, "file of --undistort": None, **source.hashes(), "file of --ranges": ranges}
-        made_from = {**source.options, **options.to_plain()}
-        self._kept = KeptFiles(folder, files, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
+        made_from = source.made_from() | options.to_plain()
+        self._kept = KeptFiles(folder, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
 
     # ---- results -----------------------------------------------------------------------------------------------------
 
     @cached_property
     def measured(self) -> Hits | DetectorMap:
         """The measured ions, or the measured map."""
-        return check_kind(self._source.read(), "measured", (Hits, DetectorMap), "Hits or a DetectorMap")
+        return check_kind(self._source.read(self._note), "measured", (Hits, DetectorMap), "Hits or a DetectorMap")
 
     @cached_property
     def measured_map(self) -> DetectorMap:
@@ -315,6 +314,7 @@ class Twin:
             return
         start = self._start()
         self._note(str(start.indexing))
+        self._note(start.size_text)
         if not start.indexing.decided:
             text = "the map does not decide: the first candidate is simulated; --pole, --line and --scales help"
             warn(text, MapWarning)
@@ -379,7 +379,7 @@ class Twin:
 
     def _as_read(self):
         """The measurement, with its file for the report, without reading it again."""
-        return MeasuredSource(lambda: self.measured, self._source.path)
+        return MeasuredSource(lambda _: self.measured, self._source.path)
 
     # ---- texts -------------------------------------------------------------------------------------------------------
 
@@ -406,17 +406,19 @@ class Twin:
 
     def _reconstruct_command(self, study):
         """Command that reconstructs with the constants, "" if they are in doubt, or without file or flight length."""
-        known, path, lens = self._known(study).arguments, self._source.path, self._options.lens
-        if "distance" not in known or path is None:
+        known, file, lens = self._known(study).arguments, self._source.file, self._options.lens
+        if "distance" not in known or file is None:
             return ""
         element = write_material(as_material(self._options.element))
-        words = ["apt-evap", "reconstruct", path_word(path), "--element", element]
+        # the flight length is one of the constants
+        words = ["apt-evap", "reconstruct", *replace(file, distance=None).words("peaks"), "--element", element]
         for name in ("distance", "detector_radius", "efficiency", "compression", "field_factor", "projection"):
             if name in known:
-                value = known[name] if isinstance(known[name], str) else f"{known[name]:.4g}"
+                # masses follow from the flight length
+                value = f"{known[name]}" if name in ("projection", "distance") else f"{known[name]:.4g}"
                 words += [f"--{name.replace('_', '-')}", value]
         words += [] if lens is None else ["--lens", lens if isinstance(lens, str) else _lens_text(lens)]
-        return shlex.join([*words, *self._source.words])
+        return shlex.join(words)
 
     def _made_answer(self):
         """Constants of the measurement, and what they depend on, as the content of a file."""
@@ -460,11 +462,6 @@ def advice_as_notes(note: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = show
-
-
-def path_word(path: str | Path) -> str:
-    """Word of a command line, a path with ./ before a dash, which would make an option of it."""
-    return f".{os.sep}{path}" if isinstance(path, Path) and str(path).startswith("-") else str(path)
 
 
 def _lens_text(lens):
@@ -556,7 +553,7 @@ def twin(
     >>> made.report()  # doctest: +SKIP
     PosixPath('R5083_twin/study/report.html')
     """
-    source = source_of(measured)
+    source = source_of(measured, distance)
     options = _Options(
         element=element,
         minutes=minutes,

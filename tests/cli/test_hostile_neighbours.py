@@ -111,6 +111,8 @@ RUNS = {
     "map": [("map", "run.h5"), ("map", "ions.epos"), ("map", "map.npz")],
     "info": [("info", "run.h5"), ("info", "ions.epos"), ("info", "map.npz")],
     "spectrum": [("spectrum", "ions.epos")],
+    "planes": [("planes", "ions.epos")],
+    "composition": [("composition", "ions.epos")],
     "index": [("index", "ions.epos", "--element", "Ni", "--scales", "50,50")],
     "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50")],
     "export": [("export", "run.h5", "-o", "x.pos"), ("export", "ions.epos", "-o", "x.csv")],
@@ -141,12 +143,12 @@ RUNS = {
     "dataset": [("dataset", "study.toml", "-o", "set")],
     "visible": [("visible", "visible.toml")],
 }
-"""Command lines of all commands but two: `explore` and `twin` are below."""
+"""Command lines of all commands but `explore` and `twin`, which are below, and `paper`, which makes twins."""
 SLOW = ("index", "start", "compare")
 
 
 def test_every_command_is_here():
-    assert set(RUNS) | {"explore", "twin"} == set(COMMANDS)
+    assert set(RUNS) | {"explore", "twin", "paper"} == set(COMMANDS)
 
 
 LINES = [

@@ -131,7 +131,7 @@ def test_the_lines_of_the_explorer_have_the_same_masses(tmp_path):
     rows.tofile(path)
     words = ["explore", str(path), "--distance", "90", "--t0", "12.5", "--mass", "20,60"]
     explorer, _ = explorer_and_view(make_parser("explore").parse_args(words))
-    hits = eval(explorer.ions_of_file.code(explorer.measured_code), {"ae": ae})
+    hits = eval(explorer.ions_of_file.code, {"ae": ae})
     assert np.array_equal(hits.mass_to_charge, explorer.measured.mass_to_charge) and 100 < len(hits) < 2900
     # the voltage of an ion is that at the top of the pulse
     time, across = hits.time_of_flight - 12.5, hits.x**2 + hits.y**2

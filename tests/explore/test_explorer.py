@@ -17,11 +17,12 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.explore.controls import MECHANISMS, controls_of, perturbation_of, values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
-from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
+from apt_evap.explore.measured_ions import IonSelection
 from apt_evap.explore.placement import misplaced
 from apt_evap.explore.specimen_surface import surface_atoms
 from apt_evap.fit.indexed_registration import index_as_run
 from apt_evap.fit.structure import PoleMeasure
+from apt_evap.io.measured_file import MeasuredFile
 
 TURNED = ae.Registration(20.0, 0.5, (1.0, -2.0), True)
 ENERGY = ae.TruncatedNormal(0.2, 0.1)
@@ -468,7 +469,7 @@ def test_a_measurement_alone(measured, as_map, tmp_path, monkeypatch):
     ae.write("ions.epos", measured)
     ions = ae.read("ions.epos")
     given = ions.map(64) if as_map else ions
-    explorer = Explorer(None, given, measured_arguments=["ions.epos"], measured_code="ae.read('ions.epos')")
+    explorer = Explorer(None, given, file=MeasuredFile("ions.epos"))
     settings = replace(explorer.start, bins=32)
     maps = explorer.show(settings)
     assert maps.simulated is None and maps.similarity is None and maps.ions == 0
@@ -525,8 +526,8 @@ def test_a_file_is_opened_beside_the_others(run, measured, tmp_path, monkeypatch
 
 def test_a_run_keeps_the_selected_ions(run, measured):
     """Ions that were selected on the page are those beside a run that is opened later."""
-    words = {"run_arguments": ["run.h5"], "measured_arguments": ["ions.epos"]}
-    before = Explorer(None, MeasuredIons(measured), **words)
+    words = {"run_arguments": ["run.h5"], "file": MeasuredFile("ions.epos")}
+    before = Explorer(None, measured, **words)
     before.ions_of_file.select(IonSelection(ions=(0, 500)))
     before.selection_changed()
     explorer = Explorer(run, measured, **words)
@@ -536,7 +537,7 @@ def test_a_run_keeps_the_selected_ions(run, measured):
     shown = explorer.show(explorer.start)
     assert shown.whole.ions <= 500 and "--ions=0,500" in explorer.commands(shown.settings).shell
     assert explorer.registration.scale == pytest.approx(size, rel=0.1) and not explorer.registered
-    other = Explorer(run, measured, run_arguments=["run.h5"], measured_arguments=["other.epos"])
+    other = Explorer(run, measured, run_arguments=["run.h5"], file=MeasuredFile("other.epos"))
     other.keep_ions(before)
     assert other.measured is not before.measured
 

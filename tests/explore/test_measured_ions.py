@@ -13,6 +13,7 @@ from apt_evap.cli.parser import make_parser
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
+from apt_evap.io.measured_file import MeasuredFile
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +60,8 @@ def test_a_selection_is_the_same_as_text(hits, selection, of_times, tmp_path, mo
         columns = {name: getattr(hits, name) for name in ("x", "y", "voltage", "time_of_flight", "pulse_id")}
         hits = ae.Hits(**columns)
     monkeypatch.setattr("apt_evap.cli._files.read_file", lambda path, **options: hits)
-    chosen = MeasuredIons(hits, 90.5 if of_times else None, selection=selection)
-    explorer, view = explorer_and_view(make_parser().parse_args(["explore", "a.epos", *chosen.arguments]))
+    chosen = MeasuredIons(hits, selection.of(MeasuredFile("a.epos", distance=90.5 if of_times else None)))
+    explorer, view = explorer_and_view(make_parser().parse_args(["explore", *chosen.arguments]))
     assert np.array_equal(explorer.measured.x, chosen.hits.x) and 0 < len(chosen.hits) < len(hits)
     if selection.element == "Cu":
         assert np.mean(np.hypot(chosen.hits.x, chosen.hits.y) < 9.0) > 0.98
@@ -68,9 +69,9 @@ def test_a_selection_is_the_same_as_text(hits, selection, of_times, tmp_path, mo
     names = {}
     monkeypatch.setattr(ae, "read", lambda path, **options: hits)
     exec(command.python.partition("\nfrom apt_evap")[0], names)
-    exec("measured = " + chosen.code("ae.read('a.epos')"), names)
+    exec("measured = " + chosen.code, names)
     assert np.array_equal(names["measured"].x, chosen.hits.x)
-    assert chosen.code("ae.read('a.epos')") in command.python
+    assert chosen.code in command.python
     drawn = []
     monkeypatch.setattr(
         "apt_evap.workflows.written_pictures.save_picture",
@@ -124,8 +125,8 @@ def test_what_cannot_be_selected(hits):
     before = ions.hits
     for selection, sentence in (
         (IonSelection("W"), "W"),
-        (IonSelection(mass=(300.0, 301.0)), "no ion"),
-        (IonSelection(ions=(5, 5)), "no ion"),
+        (IonSelection(mass=(300.0, 301.0)), "select none"),
+        (IonSelection(ions=(5, 5)), "select none"),
     ):
         with pytest.raises(ValueError, match=sentence):
             ions.select(selection)

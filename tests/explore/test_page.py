@@ -32,6 +32,7 @@ from apt_evap.explore.measured_ions import IonSelection
 from apt_evap.explore.page import Page
 from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.server import serve
+from apt_evap.io.measured_file import MeasuredFile
 
 SECONDS = 60  # until a test gives up: the machine may be busy
 
@@ -342,7 +343,7 @@ def test_one_map_without_a_measurement(run):
 
 
 def test_a_measurement_alone(measured):
-    opened = Opened(Explorer(None, measured, measured_arguments=["map.npz"]))
+    opened = Opened(Explorer(None, measured, file=MeasuredFile("map.npz")))
     page = opened.page
     assert len(page.figures.figures) == 1 and page.emission is None and "atoms" not in page.tools.choice.labels
     assert np.array_equal(image(page.figures.sources[0]), page.maps.whole.density.astype(np.float32), equal_nan=True)
@@ -599,7 +600,7 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     np.savez("specimen.npz", counts=measured.values, x_edges_mm=measured.x_edges, y_edges_mm=measured.y_edges)
     asked, state = [], ServerState()
     measured = replace(measured, source="specimen.npz")
-    explorer = Explorer(None, measured, measured_arguments=["specimen.npz"])
+    explorer = Explorer(None, measured, file=MeasuredFile("specimen.npz"))
     opened = Opened(explorer, opened=lambda path, document: lambda: asked.append(path), state=state)
     index, panel = opened.page.index, opened.page.simulation
     panel._simulate_or_stop()
@@ -629,7 +630,7 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     assert beside.registration_options["start"].shift == pytest.approx(start.shift, abs=0.1)
     panels = read_config(run.with_suffix(".toml")).maps.panels
     assert view.perturbation == panels[1].perturbation and view.perturbation.energy == 0.35
-    again = Opened(Explorer(None, measured, measured_arguments=["specimen.npz"]), state=state).page
+    again = Opened(Explorer(None, measured, file=MeasuredFile("specimen.npz")), state=state).page
     assert again.index.material.value == "Ni" and len(again.index.read().poles) == 3
     assert np.array_equal(again.index.candidates[0][0].matrix, index.candidates[0][0].matrix)
     assert len(again.index.lines.data["x"]) > 10
@@ -645,7 +646,7 @@ def test_candidates_of_a_search_are_those_of_its_ions():
     state, row = ServerState(), (ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0), "undecided")
 
     def page_of(ions):
-        return Opened(Explorer(None, ions, measured_arguments=["ions.epos"]), state=state).page
+        return Opened(Explorer(None, ions, file=MeasuredFile("ions.epos")), state=state).page
 
     first = page_of(hits)
     first.index.material.value = "Ni"
@@ -664,10 +665,10 @@ def test_ions_of_a_replaced_file_are_not_kept():
     """A run that is opened keeps the selection of the same ions, not the ions of a file that was replaced."""
     hits = ae.Hits(x=np.arange(9.0), y=np.zeros(9), mass_to_charge=np.full(9, 63.0))
     other = replace(hits, y=np.ones(9))
-    before = Explorer(None, hits, measured_arguments=["ions.epos"])
+    before = Explorer(None, hits, file=MeasuredFile("ions.epos"))
     before.ions_of_file.select(IonSelection(ions=(0, 4)))
     for ions, n in ((hits, 4), (other, 9)):
-        opened = Explorer(None, ions, measured_arguments=["ions.epos"])
+        opened = Explorer(None, ions, file=MeasuredFile("ions.epos"))
         opened.keep_ions(before)
         assert len(opened.measured) == n and np.array_equal(opened.measured.y, ions.y[:n])
 
@@ -679,7 +680,7 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     mass = rng.choice([62.93, 64.93, 13.988], n, p=[0.5, 0.22, 0.28]) * rng.normal(1.0, 3e-4, n)
     x, y = rng.normal(size=(2, n)) * 8.0
     hits = ae.Hits(x=x, y=y, mass_to_charge=mass, pulse_id=np.arange(n))
-    opened = Opened(Explorer(None, hits, measured_arguments=["ions.epos"]))
+    opened = Opened(Explorer(None, hits, file=MeasuredFile("ions.epos")))
     page, panel = opened.page, opened.page.spectrum
     opened.settle(lambda: panel.named is not None)
     opened.settle(lambda: page.explorer.ions_of_file.selection.element == "Cu" and "Da" in panel.told.text)

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.cli._files import measured_source
 from apt_evap.cli.main import main
+from apt_evap.cli.parser import make_parser
 from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.warnings import warn
 from apt_evap.workflows import kept_files, twin_of_map
 from apt_evap.workflows.kept_files import RECORD, KeptFiles
+from apt_evap.workflows.twin_of_map import Twin, _Options
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 
@@ -216,15 +219,16 @@ def test_the_content_of_the_first_step_is_checked(quick, capsys, tmp_path):
 
 
 def test_the_digest_is_recorded_before_the_file(tmp_path):
-    kept = KeptFiles(tmp_path / "t", {"FILE": "1"}, {"scales": (1.0, 2.0)}, ["a"])
+    one, two = "1" * 64, "2" * 64
+    kept = KeptFiles(tmp_path / "t", {"FILE": one, "scales": (1.0, 2.0)}, ["a"])
     assert not kept.has("a") and not (tmp_path / "t").exists()
     kept.write({"a": b"1"})
-    again = KeptFiles(tmp_path / "t", {"FILE": "1"}, {"scales": [1.0, 2.0]}, ["a"])
+    again = KeptFiles(tmp_path / "t", {"FILE": one, "scales": [1.0, 2.0]}, ["a"])
     assert again.has("a") and again.read("a") == b"1"
     again.forget("a")
     assert os.listdir(tmp_path / "t") == [RECORD]
     with pytest.raises(ae.FileError, match="another FILE"):
-        KeptFiles(tmp_path / "t", {"FILE": "2"}, {"scales": [1.0, 2.0]}, ["a"])
+        KeptFiles(tmp_path / "t", {"FILE": two, "scales": [1.0, 2.0]}, ["a"])
 
 
 @pytest.mark.slow
@@ -247,7 +251,7 @@ def test_ions_without_a_voltage_are_left_out_of_the_constants(tmp_path, indexed_
 @pytest.mark.slow
 def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
     """The same folder for both, and nothing is done again; ions in memory are another measurement than their file."""
-    assert main(["twin", "ni.epos", *ARGUMENTS, "-o", "t"]) == 0
+    assert main(["twin", "ni.epos", *ARGUMENTS, "--all-ions", "-o", "t"]) == 0
     said = capsys.readouterr().out.splitlines()
     quick.clear()
     made = ae.twin("ni.epos", "Ni", scales=(56, 64), folder="t")
@@ -267,6 +271,20 @@ def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
     with pytest.raises(ae.FileError, match="another FILE"):
         ae.twin(ae.read("ni.epos"), "Ni", scales=(56, 64), folder="t")
     assert quick == ["run", "index"]
+
+
+def test_ions_of_the_peaks_are_not_all_ions(quick, capsys):
+    """The command selects those of the crystal, the function takes all; and off is not the same as not given."""
+    source = measured_source(make_parser("twin").parse_args(["twin", "ni.epos", *ARGUMENTS]))
+    chosen = _Options("Ni", 10.0, None, None, None, 0.5, (56.0, 64.0), (), (), None)
+    how = {"threads": 1, "progress": False, "note": print, "command": ""}
+    Twin(Path("t"), source, chosen, **how)._kept.write({"answer.txt": b"an answer"})
+    with pytest.raises(ae.FileError, match=r"'t' was made with --all-ions = 'no, those of Ni', but True is asked for"):
+        ae.twin("ni.epos", "Ni", scales=(56, 64), folder="t")
+    assert "--partial = None, but True" in refused(capsys, "ni.epos", *ARGUMENTS, "-o", "t", "--partial")
+    with pytest.raises(ae.FileError, match="--partial = None, but False"):
+        Twin(Path("t"), replace(source, file=replace(source.file, partial=False)), chosen, **how)
+    assert quick == []
 
 
 @pytest.mark.slow

@@ -11,9 +11,10 @@ from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.cli.main import main
+from apt_evap.io import measured_file
 from apt_evap.plot.report.html_page import read_report
 from apt_evap.warnings import WorkflowWarning
-from apt_evap.workflows import compare_maps, measured_source
+from apt_evap.workflows import compare_maps
 
 SMALL = """
 [tip]
@@ -149,7 +150,7 @@ def test_a_comparison_takes_what_a_simulation_returned_and_reads_nothing_twice(f
     simulated = ae.simulate("small.toml", progress=False)
     expected = ae.compare("small.h5", "map.npz", None, GRID, QUICK, registration=HERE, progress=False)
     monkeypatch.delattr(compare_maps, "load")
-    monkeypatch.delattr(measured_source, "sha256_of")
+    monkeypatch.delattr(measured_file, "sha256_of")
     study = ae.compare(simulated, "map.npz", "mine", GRID, QUICK, registration=HERE, progress=False)
     assert study.to_dict() == expected.to_dict()
     report = read_report("mine/report.html")
