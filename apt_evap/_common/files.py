@@ -49,7 +49,15 @@ def check_path(path: Any) -> Path:
         raise FileError(
             f"path must be a file name in {encoding}, the encoding of this locale, got {path!a:.80}"
         ) from None
-    return Path(path)
+    return _without_tilde(Path(path))
+
+
+def _without_tilde(path):
+    """The path, with the home folder for a leading ~, as a shell has it."""
+    if path.parts[:1] and path.parts[0].startswith("~") and not path.exists():
+        with suppress(RuntimeError):  # of a user that does not exist
+            return path.expanduser()
+    return path
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io._points import is_data
 from apt_evap.io._texts import read_head, read_text, without_compression
 from apt_evap.io.apt import chunk_apt, read_apt
-from apt_evap.io.csv import write_csv
+from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
 from apt_evap.io.epos import chunk_epos, read_epos, write_epos
@@ -98,7 +98,8 @@ FORMATS = (
     Format(".npz", b"PK", read_map),
     Format(".xyz", None, None, write_xyz, keeps=is_data),
     Format(".vtp", None, None, write_vtp, keeps=is_data),
-    Format(".csv", None, None, write_csv),
+    Format(".csv", None, read_csv, write_csv),
+    Format(".txt", None, read_csv),
     Format(".tapsim", TAPSIM, read_tapsim, write_tapsim, keeps=lambda name, _: name in TAPSIM_COLUMNS),
 )
 

@@ -147,8 +147,12 @@ def _hits(file, entry, columns):
 
 def _column(file, place, name):
     _, width, factors, unit = _COLUMNS[name]
-    shape = (None,) if width == 1 else (None, width)
-    values = file.read(place, None, shape, compressed=True)
+    values = file.read(place, None, None, compressed=True)
+    if width == 1 and values.ndim == 2 and values.shape[1] == 1:
+        values = values[:, 0]
+    expected = (width,) if width > 1 else ()
+    if not values.ndim or values.shape[1:] != expected:
+        raise ValueError(f"{place} must have shape ({', '.join(['any', *map(str, expected)])}), got {values.shape}")
     if values.dtype.kind not in ("iuf" if factors else "iu"):
         kind = "numbers" if factors else "integers"
         raise FileError(f"{file.name!r}: {place} must contain {kind}, got {values.dtype}")
