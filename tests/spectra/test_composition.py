@@ -122,6 +122,9 @@ def test_saved_ranges_give_the_same_composition(tmp_path):
     result = ae.spectrum(hits)
     ae.io.write_rrng(tmp_path / "a.rrng", result.ranges())
     ranges = read_ranges(tmp_path / "a.rrng")
+    # 2 atoms in a bcc cell of 0.2867 nm; oxygen has no crystal in the table, so no volume
+    assert ranges.volume[ranges.names.index("Fe")] == pytest.approx(0.2867**3 / 2, rel=0.01)
+    assert np.isnan(ranges.volume[ranges.names.index("FeO")])
     counted = ranges.count_atoms(hits)
     share = {name: 100 * number / sum(counted.values()) for name, number in counted.items()}
     for name, value in truth(ions).items():
