@@ -42,7 +42,7 @@ def detected(path, emission="rest", seed=7):
     voltage = scipy.ndimage.gaussian_filter1d(kept["voltage"], 0.15 / 8.4 * len(rows), mode="nearest")
     phase = kept["phase"].astype(int)
     solute = rng.random(len(phase)) < np.array(SHARES)[np.minimum(phase, 2)]
-    if kept["species"].any():
+    if path.stem.startswith("alloy"):  # in the others the species is that of the phase
         solute = kept["species"] > 0
     element = np.where(solute, "Cu", "Al")
     hits = ae.Hits(x=places[rows, 0], y=places[rows, 1], voltage=voltage[rows], extra={"element": element[rows]})
