@@ -248,7 +248,7 @@ def choose_separation(
     >>> solute = np.r_[rng.random(5000) < 0.02, np.ones(60, bool)]
     >>> choice = ae.measures.choose_separation(np.r_[matrix, particle], solute)
     >>> print(f"d_max {choice.d_max:.2f} nm, N_min {choice.n_min}, p = {choice.p_value:.2f}")
-    d_max 0.77 nm, N_min 6, p = 0.05
+    d_max 0.77 nm, N_min 5, p = 0.05
     """
     places, solutes = _checked(positions, solute)
     n = int(np.count_nonzero(solutes))
@@ -262,7 +262,9 @@ def choose_separation(
         steps = check_array(separations, "separations", ("k",))
         if not (len(steps) and steps[0] > 0 and (np.diff(steps) > 0).all()):
             raise ValueError(f"separations must be increasing numbers > 0 [nm], got {separations!r:.80}")
-    rows = [np.flatnonzero(solutes)] + [np.sort(random.permutation(len(places))[:n]) for _ in range(trials)]
+    rows = [np.flatnonzero(solutes)] + [
+        np.sort(random.choice(len(places), n, replace=False, shuffle=False)) for _ in range(trials)
+    ]
     table = np.array([_by_size(places[chosen], steps) for chosen in rows])
     clusters, members = table[:, 0], table[:, 1] / n  # with at least 0, 1, 2, ... solutes, at each separation
     gain, fewest = np.zeros((trials + 1, len(steps))), np.zeros((trials + 1, len(steps)), np.int64)
@@ -291,7 +293,7 @@ def choose_separation(
 
 def _smallest(places, solutes, steps, gain, fewest, random):
     """Number of the smallest separation that finds all but what joins by chance, within the error of the counts."""
-    sample = places[random.permutation(len(places))[:_SAMPLE]]
+    sample = places[random.choice(len(places), min(_SAMPLE, len(places)), replace=False, shuffle=False)]
     score = np.full(len(steps), -np.inf)
     for row in np.flatnonzero(gain > 0):
         members = _of_solutes(places[solutes], ClusterSettings(float(steps[row]), int(fewest[row]))) >= 0
@@ -367,7 +369,9 @@ def nearest_neighbours(
         raise ValueError(f"solute must mark more than {order} ions and not all of them, got {n:,} of {len(places):,}")
     trials, bins = check_count(trials, "trials", at_least=2), check_count(bins, "bins", at_least=1, at_most=10_000)
     random = np.random.default_rng(check_seed(seed))
-    labellings = [np.flatnonzero(solutes)] + [np.sort(random.permutation(len(places))[:n]) for _ in range(trials)]
+    labellings = [np.flatnonzero(solutes)] + [
+        np.sort(random.choice(len(places), n, replace=False, shuffle=False)) for _ in range(trials)
+    ]
     # without a search of all neighbours up to the k-th: a column of the result only
     distances = [scipy.spatial.cKDTree(places[rows]).query(places[rows], k=[order + 1])[0][:, 0] for rows in labellings]
     edges = np.linspace(0.0, float(np.quantile(np.concatenate(distances), 0.999)) * (1 + 1e-9) + 1e-12, bins + 1)
