@@ -11,8 +11,9 @@ import io
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
+from importlib import import_module
 from typing import Any, BinaryIO, NamedTuple
 
 import h5py
@@ -27,6 +28,7 @@ _FORMATS = {"run": 2}  # numbers of the formats of kinds of content that are not
 _CHUNK = 1 << 20  # bytes; HDF5 keeps chunks up to this size while rows of them are read
 _LEVEL = 1  # of deflate; of runs, level 6 saves 5 % more and takes three times as long
 _DEFLATED = 1032  # largest ratio of deflate: 258 bytes in 2 bits (zlib.net/zlib_tech.html)
+_PLUGINS = {32000: "lzf", 32001: "blosc", 32004: "lz4", 32008: "bitshuffle", 32015: "zstd", 32026: "blosc2"}
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FOREIGN = "data outside the file are not read"
 _READ_ERRORS = (KeyError, IndexError, RuntimeError, TypeError, ValueError, AttributeError, OverflowError)
@@ -147,6 +149,14 @@ def label_of(path: AnyPath) -> Label | None:
         return file.label
 
 
+def _filter_exists(number):
+    """Whether HDF5 can decompress: lzf is in h5py, the others in hdf5plugin, if that is installed."""
+    if not h5py.h5z.filter_avail(number):
+        with suppress(ImportError):
+            import_module("hdf5plugin")
+    return h5py.h5z.filter_avail(number)
+
+
 class CheckedFile:
     """An open HDF5 file, of which nothing is read that lies outside of it or is larger than it.
 
@@ -229,10 +239,18 @@ class CheckedFile:
         level = filters.pop(h5py.h5z.FILTER_DEFLATE, (0,))[0]
         if compressed:
             filters.pop(h5py.h5z.FILTER_SHUFFLE, None)
-        largest = _DEFLATED if compressed and level else 1
+        largest = _DEFLATED if compressed and (level or filters.keys() & {*_PLUGINS}) else 1
         if max(math.prod(dimensions), math.prod(chunks)) * stored.itemsize > self._size * largest:
             raise ValueError(f"{path} has shape {dimensions}, more than a file of {self._size} bytes can contain")
-        if (level and not compressed) or filters.keys() - {h5py.h5z.FILTER_FLETCHER32}:
+        others = filters.keys() - {h5py.h5z.FILTER_FLETCHER32}
+        if compressed and others <= {*_PLUGINS}:
+            missing = [_PLUGINS[number] for number in others if not _filter_exists(number)]
+            if missing:
+                raise ValueError(
+                    f"{path} is compressed by {missing[0]}: install hdf5plugin to read it (pip install apt-evap[hdf5])"
+                )
+            others = set()
+        if (level and not compressed) or others:
             raise ValueError(f"{path} is compressed or filtered: h5repack -f NONE writes a copy that is not")
         if n_bytes * largest < math.prod(dimensions) * stored.itemsize:
             raise ValueError(f"{path} is incomplete")

@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import secrets
+import shutil
 import stat
 import sys
 import time
@@ -48,7 +49,15 @@ def check_path(path: Any) -> Path:
         raise FileError(
             f"path must be a file name in {encoding}, the encoding of this locale, got {path!a:.80}"
         ) from None
-    return Path(path)
+    return _without_tilde(Path(path))
+
+
+def _without_tilde(path):
+    """The path, with the home folder for a leading ~, as a shell has it."""
+    if path.parts[:1] and path.parts[0].startswith("~") and not path.exists():
+        with suppress(RuntimeError):  # of a user that does not exist
+            return path.expanduser()
+    return path
 
 
 @contextmanager
@@ -115,6 +124,37 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
         if part is not None:
             with suppress(OSError):
                 part.unlink()
+
+
+@contextmanager
+def new_file(path: AnyPath) -> Iterator[BinaryIO]:
+    """Write a file as `replace_file`, but replace nothing: FileError if there is something of this name at the end."""
+    path = check_path(path)
+    part = path.with_name(f"{_before(path)}{secrets.token_hex(8)}.part")
+    try:
+        with replace_file(part) as file:
+            yield file
+        try:
+            os.link(part, path)
+        except FileExistsError:
+            raise FileError(f"{str(path)!r} exists: it is not replaced") from None
+        except OSError:  # a file system without links
+            _copy_to_new(part, path)
+    finally:
+        with suppress(OSError):
+            part.unlink()
+
+
+def _copy_to_new(part, path):
+    """Copy a file to one that does not exist yet."""
+    try:
+        with open(path, "xb") as file, open(part, "rb") as source:
+            shutil.copyfileobj(source, file)
+    except FileExistsError:
+        raise FileError(f"{str(path)!r} exists: it is not replaced") from None
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise FileError(f"cannot write {str(path)!r}: {_reason(error)}") from error
 
 
 def _when_free(function, path, *arguments):

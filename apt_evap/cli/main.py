@@ -102,19 +102,22 @@ def _execute(arguments):
 
 @contextmanager
 def _drawing_into_files() -> Iterator[None]:
-    """Let matplotlib, in this process and those that it starts, draw without a screen, whatever the user's backend.
+    """Let matplotlib, in this process and those that it starts, draw without a screen and with its default settings.
 
-    The backend of a notebook, for example, is inherited by its terminals, and cannot be imported in every environment.
+    The backend of a notebook, for example, is inherited by its terminals, and cannot be imported in every environment;
+    a matplotlibrc of the user may need LaTeX.
     """
-    before = os.environ.get("MPLBACKEND")
-    os.environ["MPLBACKEND"] = "agg"
+    settings = {"MPLBACKEND": "agg", "APT_EVAP_DEFAULT_STYLE": "1"}
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
     try:
         yield
     finally:
-        if before is None:
-            del os.environ["MPLBACKEND"]
-        else:
-            os.environ["MPLBACKEND"] = before
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 @contextmanager
@@ -135,3 +138,7 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
         yield signals
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+if __name__ == "__main__":  # python -m apt_evap.cli.main, as python -m apt_evap.cli
+    sys.exit(main())

@@ -23,6 +23,7 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import field_of_view
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.evaporation.cap import FEWEST, HALF_ANGLE
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
@@ -210,7 +211,7 @@ class Config:
             if self.microscope is not None and flight_settings.field_of_view == WHOLE_DETECTOR:
                 angle = field_of_view(self.microscope, tip, self.detector)
                 flight_settings = replace(flight_settings, field_of_view=angle)
-            return Simulation(
+            simulation = Simulation(
                 tip,
                 voltage=self.voltage,
                 seed=self.seed,
@@ -223,6 +224,20 @@ class Config:
                 law=self.law,
                 rule=self.rule,
                 control=self.control,
+            )
+        with _located(self.path, "real_units" if self.microscope is None else "microscope"):
+            self._check_cap(simulation)
+        return simulation
+
+    def _check_cap(self, simulation):
+        """Raise a ValueError, before the simulation, if real units need a cap and there is none."""
+        if self.real_units is None and self.microscope is None:
+            return
+        reference = (self.real_units or OperatingPoint()).field_reference
+        if reference == "cap" and math.isnan(simulation.emitter.cap.ratio):
+            raise ValueError(
+                f'field_reference = "cap" needs at least {FEWEST} evaporable atoms within {HALF_ANGLE:g} degrees of '
+                'the axis, the tip has fewer: use a larger apex_radius, or field_reference = "site"'
             )
 
     def with_origin(self, run: Run) -> Run:

@@ -50,6 +50,8 @@ class DistortionGrid:
     source: str = ""
     residual: float = field(init=False)
     """Root mean square distance of the distorted from the corrected crossings [mm]."""
+    mirrored: bool = field(init=False)
+    """Whether the grid fits the detector better mirrored, as if the axes of one of them were exchanged."""
 
     def __post_init__(self):
         detector = check_array(self.detector, "detector", ("n", 2))
@@ -63,7 +65,7 @@ class DistortionGrid:
                 raise ValueError(f"{name} must have different crossings {where}, got {places[first].tolist()} twice")
             if np.linalg.matrix_rank(places - places.mean(axis=0), tol=1e-6 * np.abs(places).max()) < 2:
                 raise ValueError(f"{name} must not have all crossings on one line {where}")
-        fitted = _similarity(grid, detector)
+        fitted, mirrored = _similarity(grid, detector)
         triangles = scipy.spatial.Delaunay(detector)
         corners = triangles.simplices
         proper = _thickness(detector[corners]) > _SLIVER
@@ -74,6 +76,7 @@ class DistortionGrid:
                 f"{name} must not be folded: adjacent crossings around ({folded[0]:.3g}, {folded[1]:.3g}) mm on the "
                 "detector are in another order in the plane of the grid"
             )
+        object.__setattr__(self, "mirrored", mirrored)
         object.__setattr__(self, "detector", detector)
         object.__setattr__(self, "grid", grid)
         object.__setattr__(self, "residual", float(np.sqrt(np.mean(np.sum((fitted - detector) ** 2, axis=1)))))
@@ -105,15 +108,16 @@ class DistortionGrid:
 
 
 def _similarity(grid, detector):
-    """Places of the grid after the similarity transform, mirrored if necessary, that fits the detector best."""
+    """Places of the grid after the similarity transform that fits the detector best, and whether it is mirrored."""
     target = detector @ [1, 1j]
     fits = []
     for points in (grid @ [1, 1j], grid @ [1, -1j]):
         matrix = np.column_stack([points, np.ones(len(points))])
         moved = matrix @ np.linalg.lstsq(matrix, target, rcond=None)[0]
         fits.append((float(np.abs(moved - target).sum()), moved))
-    moved = min(fits, key=lambda fit: fit[0])[1]
-    return np.column_stack([moved.real, moved.imag])
+    mirrored = fits[1][0] < fits[0][0]
+    moved = fits[mirrored][1]
+    return np.column_stack([moved.real, moved.imag]), mirrored
 
 
 def _areas(corners):

@@ -19,7 +19,7 @@ _FEWEST = 16  # of so few ions, none is far outside
 # line, rims of 1 % of the density, two measured ones) and 240 sets of strays, and judged on the other half: no ion of a
 # field of view is taken for a stray, but for a few in the tails of a normal distribution.
 _GAP = 1 / 6  # of the longer side: ions this far from the others are strays
-_GAP_OF_FEW = 3.0  # times the mean distance of neighbours if that is more: few ions are farther apart
+_GAP_OF_FEW = 4.0  # times the mean distance of neighbours if that is more: few ions are farther apart
 _DENSITY = 1e-3  # of the median density, averaged over a gap: fewer ions between strays do not join them
 _PART = 0.05  # of the different places in the largest part: a part with fewer is stray
 _SAMPLE = 50_000

@@ -11,7 +11,7 @@ from apt_evap._common.types import Floats
 from apt_evap._core.elementary import sine_and_cosine, total
 
 HALF_ANGLE = 45.0  # degrees from the axis: about what an instrument sees, and far from the shank
-_FEWEST = 12  # surface atoms: three times the unknowns of the sphere
+FEWEST = 12  # surface atoms: three times the unknowns of the sphere
 _ROUNDS = 3  # the selection of atoms depends on the centre; it changed by less than 1e-3 R after the second round
 
 
@@ -67,12 +67,14 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     chosen = np.flatnonzero(normals[:, 2] >= cosine)
     radius = math.nan
     for _ in range(_ROUNDS):
-        if len(chosen) < _FEWEST:
+        if len(chosen) < FEWEST:
             return NO_CAP
         centre, radius = fit_sphere(positions[chosen])
         above = np.flatnonzero(positions[:, 2] >= centre[2])
         from_centre = positions[above] - centre
         chosen = above[from_centre[:, 2] >= cosine * lengths(from_centre)]
+    if len(chosen) < FEWEST:
+        return NO_CAP
     fields = fields[chosen]
     weights = fields / total(fields)  # fields are proportional to charges
     ratio = total(weights * fields / evaporation_fields[chosen])

@@ -61,7 +61,11 @@ def serve(
     """Make the server of a page that only the holder of its address can open, from this machine."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((_ADDRESS, port))
+        try:
+            probe.bind((_ADDRESS, port))
+        except OSError as error:
+            reason = error.strerror
+            raise ValueError(f"port {port} of {_ADDRESS} cannot be used ({reason}): --port names another") from error
         port = probe.getsockname()[1]
     state = ServerState()
     shown = explorer, settings  # also after the page is loaded again

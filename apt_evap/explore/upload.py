@@ -8,11 +8,12 @@ from typing import Any
 from bokeh.util.token import check_session_id_signature
 from tornado.web import HTTPError, RequestHandler, stream_request_body
 
-from apt_evap._common.files import open_regular, replace_file
+from apt_evap._common.files import new_file, open_regular
 from apt_evap._common.validation import short_text
 from apt_evap.explore.start_page import MEASUREMENTS, RUNS
 
 _LARGEST = 64 << 30  # bytes
+_LONGEST = 200  # bytes of a name: file systems have 255, and the temporary name is longer
 
 
 class _StoppedError(Exception):
@@ -41,14 +42,16 @@ class UploadHandler(RequestHandler):
             raise HTTPError(403)
         connection: Any = self.request.connection
         connection.set_max_body_size(_LARGEST)
-        name = self.get_query_argument("name")
+        # as it was sent: Tornado would take control characters and spaces out of it
+        name = self.request.query_arguments.get("name", [b""])[-1].decode(errors="replace")
         self._path = Path(name)
-        if name != self._path.name or name in ("", ".", "..") or "\\" in name:
-            self._refused = f"a dropped file must have a plain name, got {short_text(name)}"
+        is_plain = name == self._path.name and name not in ("", ".", "..") and "\\" not in name and name.isprintable()
+        if not is_plain or len(os.fsencode(name)) > _LONGEST:
+            self._refused = f"a dropped file must have a plain name of at most {_LONGEST} bytes, got {short_text(name)}"
         elif self._path.suffix.lower() not in (*RUNS, *MEASUREMENTS):
             known = ", ".join((*MEASUREMENTS, *RUNS))
             self._refused = f"a dropped file must be one of {known}, got {short_text(name)}"
-        elif self._path.exists():
+        elif os.path.lexists(self._path):
             self._guarded(self._open_present)
         else:
             self._guarded(self._begin)
@@ -99,7 +102,7 @@ class UploadHandler(RequestHandler):
             present.close()
 
     def _begin(self):
-        self._writing = replace_file(self._path)
+        self._writing = new_file(self._path)
         self._file = self._writing.__enter__()
 
     def _end(self, error):
@@ -110,7 +113,7 @@ class UploadHandler(RequestHandler):
         """Do a part of the work; after an error nothing is written."""
         try:
             work()
-        except (OSError, _StoppedError) as error:
+        except (OSError, ValueError, _StoppedError) as error:
             self._refused, self._file = str(error), None
             if self._writing is not None:
                 self._guarded(partial(self._end, _StoppedError()))

@@ -17,7 +17,7 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._version import __version__
-from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
+from apt_evap.config.cost_estimate import CostEstimate, estimate_cost, hours_text
 from apt_evap.config.material_text import material_value
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.config.simulation_file import config_of
@@ -84,6 +84,21 @@ class StartSettings:
 
     def __repr__(self) -> str:
         return short_repr(self)
+
+    @property
+    def size_text(self) -> str:
+        """Which radius is simulated for which measured one, and why."""
+        if math.isnan(self.radii[0]):
+            measured = "that of the specimen is not known, the file has no voltages"
+        else:
+            low, high = sorted(self.radii)
+            measured = f"that of the specimen is {low:.0f} to {high:.0f} nm by its voltages"
+        is_largest = self.simulated_radius >= RADII[0] * self.indexing.best.orientation.material.a
+        why = (
+            "the largest that is simulated" if is_largest else "the largest of those not above it that the time allows"
+        )
+        minutes = "" if self.cost.hours is None else f", about {hours_text(self.cost.hours)} of one processor"
+        return f"simulating R = {self.simulated_radius:.1f} nm, {why}{minutes}; {measured}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return radii [nm], None if they are not known, and the indexing in plain types, dict."""

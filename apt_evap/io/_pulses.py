@@ -1,11 +1,13 @@
 """Pulses of the ions: checks of the conventions of the formats, and conversion to pulse_id and multiplicity."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apt_evap._common.types import Integers
+from apt_evap._common.types import AnyPath, Integers
+from apt_evap.warnings import DataWarning, warn
 
 _BLOCK = 1 << 15  # rows that fit into the cache
 
@@ -120,6 +122,32 @@ def first_from_equal(numbers: NDArray[np.integer]) -> NDArray[np.uint32]:
         first = np.flatnonzero(np.concatenate([[True], numbers[1:] != numbers[:-1]]))
         ions[first] = np.diff(first, append=len(numbers))
     return ions
+
+
+def are_grouped(blocks: Iterable[NDArray[np.integer]], path: AnyPath) -> bool:
+    """Whether consecutive ions with the same number are a pulse; a warning if the numbers are all zero or decrease.
+
+    A decrease by 2^31 or more is that of a counter of 32 bits that wraps around.
+    """
+    has_numbers, n_decreases, last = False, 0, None
+    for numbers in blocks:
+        has_numbers = has_numbers or bool(numbers.any())
+        before = numbers[:-1] if last is None else np.concatenate([last, numbers[:-1]])
+        after = numbers[-len(before) :] if len(before) else numbers[:0]
+        falls = np.flatnonzero(after < before)
+        n_decreases += np.count_nonzero(before[falls] - after[falls] < 1 << 31)
+        last = numbers[-1:]
+    if not has_numbers:
+        problem = "pulses unknown, so pulse_id and multiplicity are None: the pulse number is zero for all ions"
+    elif n_decreases:
+        problem = (
+            "pulses uncertain, so only consecutive ions with the same pulse number are grouped: the number decreases "
+            f"at {n_decreases} rows"
+        )
+    else:
+        return True
+    warn(f"{str(path)!r}: {problem}", DataWarning)
+    return has_numbers
 
 
 def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | None:

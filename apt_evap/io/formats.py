@@ -18,9 +18,9 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io._points import is_data
-from apt_evap.io._texts import read_head, without_compression
+from apt_evap.io._texts import read_head, read_text, without_compression
 from apt_evap.io.apt import chunk_apt, read_apt
-from apt_evap.io.csv import write_csv
+from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
 from apt_evap.io.epos import chunk_epos, read_epos, write_epos
@@ -98,7 +98,8 @@ FORMATS = (
     Format(".npz", b"PK", read_map),
     Format(".xyz", None, None, write_xyz, keeps=is_data),
     Format(".vtp", None, None, write_vtp, keeps=is_data),
-    Format(".csv", None, None, write_csv),
+    Format(".csv", None, read_csv, write_csv),
+    Format(".txt", None, read_csv),
     Format(".tapsim", TAPSIM, read_tapsim, write_tapsim, keeps=lambda name, _: name in TAPSIM_COLUMNS),
 )
 
@@ -178,7 +179,8 @@ def chunks(
     rows = check_count(rows, "rows", at_least=1)
     chosen = format_of(path, format)
     if chosen.chunks is None:
-        raise FileError(f"{str(path)!r} cannot be read in chunks: the format {chosen.suffix} does not support it")
+        name = format or without_compression(check_path(path)).suffix.lower() or chosen.suffix
+        raise FileError(f"{str(path)!r} cannot be read in chunks: the format {name} does not support it")
     parts = chosen.chunks(path, rows, **_options(path, chosen, chosen.chunks, columns, options))
     return _with_warning_of_size(path, parts)
 
@@ -318,15 +320,28 @@ def read_ranges(path: AnyPath, *, format: str | None = None) -> Ranges:
         if suffix not in RANGE_FORMATS:
             raise FileError(f"format of {str(path)!r} must be one of {', '.join(RANGE_FORMATS)}, got format={format!r}")
     if suffix in RANGE_FORMATS:
-        return RANGE_FORMATS[suffix](path)
+        return _ranges_of(path, RANGE_FORMATS[suffix])
     known = f"expected one of {', '.join(RANGE_FORMATS)}, got suffix {suffix!r}"
     head = read_head(path, 64).lstrip()
     if head.startswith(_HDF5.lstrip()):
         raise FileError(f"{str(path)!r} is an HDF5 file, no file of mass ranges: {known}")
     try:
-        return read_xrng(path) if head.startswith(b"<") else read_rrng(path)
+        return _ranges_of(path, read_xrng if head.startswith(b"<") else read_rrng)
     except FileError as error:
         raise FileError(f"{error}; {known}") from error
+
+
+def _ranges_of(path, read):
+    """Ranges of a file; what they refuse, such as a control character in a name, is an error of the file."""
+    try:
+        return read(path)
+    except FileError:
+        raise
+    except ValueError as error:
+        lines = enumerate(read_text(path, "ranges of mass").split("\n"), 1)
+        odd = [at for at, line in lines if not line.replace("\t", " ").rstrip("\r").isprintable()]
+        where = f"{str(path)!r}, line {odd[0]}" if odd else f"{str(path)!r}"
+        raise FileError(f"{where}: {error}") from error
 
 
 def format_of(path: AnyPath, format: str | None = None) -> Format:

@@ -67,7 +67,8 @@ def read_map(
             if not all(isinstance(array, np.ndarray) for array in arrays.values()):
                 raise ValueError("it contains files that are not arrays")
         except Exception as error:  # every compression method has its own errors
-            reason = (str(error) or type(error).__name__).splitlines()[0]
+            text = (str(error) or type(error).__name__).splitlines()[0]  # may quote bytes of the file
+            reason = text if len(text) < 100 and text.isprintable() else "it is damaged"
             raise FileError(f"cannot read {str(path)!r} as an .npz file: {reason}") from error
     contents = ", ".join(f"{name} {array.dtype}{list(array.shape)}" for name, array in arrays.items()) or "no array"
 

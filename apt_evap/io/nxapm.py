@@ -171,9 +171,9 @@ def _read(file: CheckedFile, columns: Sequence[str] | None) -> Hits:
     )
 
 
-def numbers(file: CheckedFile, path: str) -> Any:
+def numbers(file: CheckedFile, path: str, *, compressed: bool = False) -> Any:
     """Read a complete dataset of numbers of any type, with one or more values per row, in native byte order."""
-    values = file.read(path, None, None)
+    values = file.read(path, None, None, compressed=compressed)
     if values.dtype.kind not in "biuf" or not values.shape:
         raise ValueError(f"{path} must contain numbers, got {values.dtype} of shape {values.shape}")
     return values.astype(values.dtype.newbyteorder("="), copy=False)

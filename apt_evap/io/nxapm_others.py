@@ -14,7 +14,7 @@ from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 from apt_evap.detection.hits import Hits
-from apt_evap.io._pulses import first_from_equal, ions_per_pulse, pulses_from_first
+from apt_evap.io._pulses import are_grouped, first_from_equal, ions_per_pulse, pulses_from_first
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.warnings import DataWarning, warn
 
@@ -147,8 +147,12 @@ def _hits(file, entry, columns):
 
 def _column(file, place, name):
     _, width, factors, unit = _COLUMNS[name]
-    shape = (None,) if width == 1 else (None, width)
-    values = file.read(place, None, shape, compressed=True)
+    values = file.read(place, None, None, compressed=True)
+    if width == 1 and values.ndim == 2 and values.shape[1] == 1:
+        values = values[:, 0]
+    expected = (width,) if width > 1 else ()
+    if not values.ndim or values.shape[1:] != expected:
+        raise ValueError(f"{place} must have shape ({', '.join(['any', *map(str, expected)])}), got {values.shape}")
     if values.dtype.kind not in ("iuf" if factors else "iu"):
         kind = "numbers" if factors else "integers"
         raise FileError(f"{file.name!r}: {place} must contain {kind}, got {values.dtype}")
@@ -169,10 +173,15 @@ def _column(file, place, name):
 def _pulses(table, name):
     """Pulses from the ions per pulse of an .epos, or from the numbers of the pulses."""
     numbers, ions = table.pop("pulse_number", None), table.pop("ions_per_pulse", None)
+    if numbers is not None and not numbers.any() and ions is not None:
+        numbers = None  # the other column has them
     if numbers is not None and len(numbers):
-        first = first_from_equal(numbers)
-        table["pulse_id"] = numbers.astype(np.int64)
-        table.setdefault("multiplicity", pulses_from_first(first)[1])
+        if are_grouped([numbers], name):
+            pulse_id, multiplicity = pulses_from_first(first_from_equal(numbers))
+            # numbers that increase are kept
+            kept = int(numbers.max()) < 1 << 63 and not (numbers[1:] < numbers[:-1]).any()
+            table["pulse_id"] = numbers.astype(np.int64) if kept else pulse_id
+            table.setdefault("multiplicity", multiplicity)
     elif ions is not None and len(ions):
         first, problem = ions_per_pulse(ions)
         if first is None:

@@ -100,7 +100,7 @@ def _instrument(file):
     for column, (names, factor) in _INSTRUMENT.items():
         stored = next((f"dld/{name}" for name in names if f"dld/{name}" in file), None)
         if stored is not None:
-            columns[column] = _scaled(_one_column(numbers(file, stored), stored), factor)
+            columns[column] = _scaled(_one_column(numbers(file, stored, compressed=True), stored), factor)
     return columns
 
 
@@ -124,14 +124,14 @@ def _calibrated(file, path):
     for index in range(_MAX_BLOCKS):
         if f"df/block{index}_items" not in file:
             break
-        items = file.read(f"df/block{index}_items", None, None)
+        items = file.read(f"df/block{index}_items", None, None, compressed=True)
         if items.dtype.kind != "S" or len(items.shape) != 1:
             raise ValueError(f"df/block{index}_items must contain the names of columns")
         names = [name.decode("utf-8", "replace") for name in items.tolist()]
         known += names
         if not any(name in known_names for name in names):
             continue  # a block of texts or lists
-        values = numbers(file, f"df/block{index}_values")
+        values = numbers(file, f"df/block{index}_values", compressed=True)
         if values.ndim != 2 or values.shape[1] != len(names):
             raise ValueError(f"df/block{index}_values must have {len(names)} columns, got shape {values.shape}")
         table |= {name: values[:, k] for k, name in enumerate(names) if name in known_names}

@@ -10,9 +10,8 @@ import numpy as np
 
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
-from apt_evap.io._pulses import first_from_equal, pulses_from_first
+from apt_evap.io._pulses import are_grouped, first_from_equal, pulses_from_first
 from apt_evap.io._records import check_any, choose_fields, in_mm, open_words
-from apt_evap.warnings import DataWarning, warn
 
 _ROW = 32
 _FIELDS = {
@@ -72,7 +71,7 @@ def read_raw(
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
         block = words.read(fields)
-        grouped = "pulse_number" in block and _grouped([block["pulse_number"]], path)
+        grouped = "pulse_number" in block and are_grouped([block["pulse_number"]], path)
         return _hits(in_mm(block, detector_unit), grouped, chosen, path)
 
 
@@ -100,7 +99,7 @@ def chunk_raw(
     fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}
     number = {"pulse_number": _FIELDS["pulse_number"]}
     with _open(path, partial, byte_order) as words:
-        grouped = _grouped((block["pulse_number"] for block in words.survey(number)), path)
+        grouped = are_grouped((block["pulse_number"] for block in words.survey(number)), path)
 
         def keep(block):
             numbers = block["pulse_number"]
@@ -117,31 +116,6 @@ def chunk_raw(
             yield _hits(in_mm(block, detector_unit), grouped, chosen, path, first_pulse)
             first_pulse += np.count_nonzero(first_from_equal(block["pulse_number"]))
             del block
-
-
-def _grouped(blocks, path):
-    """Whether ions can be grouped by the pulse numbers; warn if these are all zero or decrease."""
-    has_numbers = False
-    n_decreases = 0
-    last = None
-    for numbers in blocks:
-        has_numbers = has_numbers or numbers.any()
-        steps = numbers[1:].astype(np.int64) - numbers[:-1]
-        n_decreases += np.count_nonzero((steps < 0) & (steps > -(1 << 31)))
-        if last is not None:
-            n_decreases += -(1 << 31) < int(numbers[0]) - last < 0
-        last = int(numbers[-1])
-    if not has_numbers:
-        problem = "pulses unknown, so pulse_id and multiplicity are None: the pulse number is zero for all ions"
-    elif n_decreases:
-        problem = (
-            "pulses uncertain, so only consecutive ions with the same pulse number are grouped: the number decreases "
-            f"at {n_decreases} rows"
-        )
-    else:
-        return True
-    warn(f"{str(path)!r}: {problem}", DataWarning)
-    return bool(has_numbers)
 
 
 def _hits(block, grouped, chosen, path, first_pulse=0):

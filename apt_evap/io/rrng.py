@@ -66,6 +66,11 @@ def read_rrng(path: AnyPath) -> Ranges:
     n_lines = sum(bool(re.fullmatch(r"range\s*[0-9]+", key)) for _, _, key, _ in lines)
     if numbers and numbers[0][1] != str(n_lines):
         odd.add(numbers[0][0], f"states {numbers[0][1]:.20} ranges but contains {n_lines}", "all are read")
+    if not numbers:
+        given = [int(key[5:]) for _, _, key, _ in lines if re.fullmatch(r"range\s*[0-9]+", key)]
+        if missing := sorted(set(range(1, max(given, default=0))) - set(given))[:3]:
+            last = max(at for _, at, key, _ in lines if key.startswith("range"))
+            odd.add(last, f"the ranges end here, without Range{missing[0]} and without Number=", "all are read")
     odd.report(len(parts), "has no lines Range1=... with a range, as in an .rrng file")
     names, low, high, volume, colour, composition, species = zip(*parts, strict=True)
     _warn_of_charges(path, low, high, species)

@@ -82,7 +82,7 @@ def radial_distribution(
     of: ArrayLike,
     reach: float = 2.0,
     step: float = 0.02,
-    centres: int = 20_000,
+    centres: int = 5_000,
     seed: int = 0,
 ) -> RadialDistribution:
     """Partial radial distribution function g(r).

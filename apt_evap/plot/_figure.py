@@ -1,11 +1,13 @@
 """Figures and colour bars of all plots."""
 
 import importlib
+import os
 import re
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
 else:
     DrawnAxes = Axes
+
+if os.environ.get("APT_EVAP_DEFAULT_STYLE"):  # of a command: the settings of the user may need LaTeX
+    matplotlib.rcdefaults()
 
 OUTSIDE = "0.88"
 """Colour outside the detector."""

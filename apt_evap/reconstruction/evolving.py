@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, did_you_mean
 from apt_evap.detection.hits import Hits
-from apt_evap.reconstruction.beyond_view import Continuation, Feature, continued
+from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
 from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence, SurfacePass
 from apt_evap.reconstruction.local_composition import (
@@ -38,10 +38,16 @@ FEWEST_IONS = 2000
 WIDEST_VIEW = 60.0
 """Largest half angle of the field of view [degrees]: beyond, the response of a sphere does not describe a specimen."""
 
-EMISSION_GATE = 0.33
-"""Largest contrast of the density of the matrix on the detector: 0.19 to 0.24 at rest or with rolling of aluminium,
-0.45 if all ions roll, and then the surface is no better than the cap."""
+EMISSION_GATE = 0.30
+"""Largest contrast of the density on the detector, of the most even fifth of the ions: 0.16 to 0.23 at rest or with the
+rolling of aluminium, 0.36 to 0.43 if all ions roll, and then the surface is no better than the cap."""
 
+VOLTAGE_GATE = 0.02
+"""Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
+a layer of 1.15 times the field across the whole specimen."""
+
+_WINDOW = 0.65  # of the radius: depth in which the trend is a straight line
+_FIRST_SHAPE = 0.065  # of the radius
 _PASSES = 7  # with voltage and phases after the first: fields change by less than 0.005 in the last
 _ION_LIMIT = 150_000  # in these passes; of more ions, every n-th
 _SMOOTHING = 1 / 87  # of the radius: depth over which the voltage is averaged, 0.15 nm of R = 13 nm
@@ -55,6 +61,7 @@ _CORE = 25  # neighbours for the core of a phase
 _CORE_SHARES = 0.92, 0.8, 0.6, 0.0  # of them: the first that leaves 100 ions
 _DENSITY_WIDTH = math.radians(3.0)  # of the Gaussian of the density on the detector
 _DENSITY_BINS = 61
+_DENSITY_IONS = 5000  # of a block: its noise is 0.07
 _CONSTANT = 1e-6  # relative spread of a voltage that does not change
 
 
@@ -381,14 +388,19 @@ def _density_contrast(measured):
         matrix = ~np.any(measured.own, axis=0)
     rim = math.sin(ions.rim)  # an even flux is even in x / R and y / R
     edges = np.linspace(-1.02 * rim, 1.02 * rim, _DENSITY_BINS + 1)
-    counts = np.histogram2d(*ions.directions[matrix, :2].T, bins=(edges, edges))[0]
     centres = (edges[1:] + edges[:-1]) / 2
     inside = centres[:, None] ** 2 + centres**2 < rim**2
     width = _DENSITY_WIDTH / (edges[1] - edges[0])
-    counted, seen = (scipy.ndimage.gaussian_filter(part.astype(float), width) for part in (counts, inside))
-    density = (counted / np.maximum(seen, 0.05))[inside]
-    noise = np.count_nonzero(inside) / max(counts.sum(), 1) / (4 * math.pi * width**2)
-    return math.sqrt(max(0.0, density.var() / max(density.mean(), 1e-12) ** 2 - noise))
+    seen = np.maximum(scipy.ndimage.gaussian_filter(inside.astype(float), width), 0.05)
+    contrasts = []
+    # A precipitate changes the density of some blocks, rolling that of all: a sphere has 0.35 in all ions together.
+    places = ions.directions[matrix, :2]
+    for block in np.array_split(places, int(np.clip(len(places) // _DENSITY_IONS, 1, 5))):
+        counts = np.histogram2d(*block.T, bins=(edges, edges))[0]
+        density = (scipy.ndimage.gaussian_filter(counts, width) / seen)[inside]
+        noise = np.count_nonzero(inside) / max(counts.sum(), 1) / (4 * math.pi * width**2)
+        contrasts.append(math.sqrt(max(0.0, density.var() / max(density.mean(), 1e-12) ** 2 - noise)))
+    return min(contrasts)
 
 
 def _as_cap(cap, reason):
@@ -445,6 +457,12 @@ def _fixed_point(measured):
         positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
     )  # fmt: skip
     if not seen:
+        swing = _voltage_swing(measured)
+        if swing > VOLTAGE_GATE:
+            return (
+                f"the voltage changes by {swing:.1%} about its trend, as by a phase at the rim of the field of view, "
+                "and neither labels nor solutes show one"
+            )
         return nothing
     names = tuple(names[k] for k in seen)
     compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
@@ -475,7 +493,28 @@ def _fixed_point(measured):
         new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
         ratios = ratios.copy()
         ratios[seen] = np.clip(new, *_FIELD_LIMITS)
+    if rough := [way for way in ways if way.way == "ring"]:
+        flatness = max(way.flatness for way in rough)
+        return (
+            f"a phase reaches the rim of the field of view, {max(way.share for way in rough):.2f} of the ring, "
+            f"and is not flat: its thickness is {flatness:.2f} of its extent, above {FLAT_GATE:g}"
+        )
     return _Fixed("surface", level, trend, features, contrasts, thresholds, before, ways, ratios, errors)
+
+
+def _voltage_swing(measured):
+    """Largest range of the voltage about a straight line in windows of the depth, without the first shape."""
+    if measured.voltages is None:
+        return 0.0
+    depths = measured.ions.depths[1:] / measured.ions.radius
+    later = depths > _FIRST_SHAPE
+    depths, voltages = depths[later], measured.voltages[later]
+    swings = [0.0]
+    for window in np.array_split(np.arange(len(depths)), max(1, round(float(np.ptp(depths)) / _WINDOW))):
+        line = np.polyval(np.polyfit(depths[window], voltages[window], 1), depths[window])
+        low, high = np.quantile(voltages[window] / line, (0.01, 0.99))
+        swings.append(float(high - low))
+    return max(swings)
 
 
 def _features(measured, seen, contrasts, halves, positions, ratios):

@@ -16,6 +16,7 @@ CONTRAST_GATE = 3.0
 _FEWEST, _MOST = 30, 250  # neighbours for a composition
 _NEIGHBOURS = 60  # for the contrast
 _CELLS = 4_000_000  # largest grid
+_CORE = 0.5  # of the ions in the richer half, that are taken for its core
 _TURNS = 60  # of the mixture of two binomials
 _SHARPNESS = 2.1  # cells per standard deviation of the Gaussian; wider cells would blur
 
@@ -132,8 +133,20 @@ def solute_contrast(positions: Floats, solute: Booleans, halves: Booleans, volum
 
 
 def contents(found: LocalComposition, neighbours: int) -> tuple[float, float]:
-    """Content of the matrix and of the enriched phase, by a mixture of two binomials."""
-    return _two_binomials(found.all, neighbours)
+    """Content of the matrix by a mixture of two binomials, and of the core of the enriched phase.
+
+    The mixture would take the blurred interface for part of the phase. The core is where one half of the neighbours is
+    richest; the other half, whose noise is independent, gives its content.
+    """
+    matrix, phase = _two_binomials(found.all, neighbours)
+    cores = []
+    for chooser, judge in ((found.first, found.second), (found.second, found.first)):
+        inside = chooser > (matrix + phase) / 2
+        if np.count_nonzero(inside) < _FEWEST:
+            return matrix, phase
+        core = inside & (chooser >= np.quantile(chooser[inside], 1 - _CORE))
+        cores.append(float(judge[core].mean()))
+    return matrix, max(phase, sum(cores) / 2)
 
 
 def noise_free_slopes(values: Floats, found: list[LocalComposition]) -> Floats:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.validation import short_text
+from apt_evap._common.validation import short_text, without_mask
 from apt_evap.emission.perturbations import described
 from apt_evap.simulation.columns import check_sequence_of_ions, columns_of, every_column_of, parts_of
 from apt_evap.simulation.history import CapHistory, History
@@ -16,7 +16,7 @@ from apt_evap.simulation.run_table import RunTable
 def select_rows(run: RunTable, rows: Any) -> dict[str, Any]:
     """Arguments of `Run` that differ for a part of the run with these rows, see `Run.__getitem__`."""
     if not isinstance(rows, slice):
-        indices = np.asarray(rows)
+        indices = np.asarray(without_mask(rows, "rows", bool))
         if indices.ndim != 1 or (indices.size and indices.dtype.kind not in "biu"):
             raise ValueError(f"rows must be a slice, a mask or indices such as [5], got {short_text(rows)}")
         rows = indices if indices.size else np.empty(0, int)

@@ -315,6 +315,7 @@ class Explainer:
         choice.learn_shares(chosen, amplitudes)
         chosen, amplitudes, value = choice.pruned(chosen, amplitudes, chi2 + choice.cost(chosen))
         kept = [number for number, x in zip(chosen, amplitudes, strict=True) if x > 0]
+        amplitudes = amplitudes[amplitudes > 0]
         fit = choice.fit
         losses = [fit.solve(r)[1] + choice.cost(r) - value for r in ([n for n in kept if n != m] for m in kept)]
         final, covariance = self.amounts(fit, kept)

@@ -18,7 +18,7 @@ _UNUSUAL = (
     15.0  # of unusual molecules, of three atoms of a metal, and of a charge of three or more without the one below
 )
 _NO_ATOMS = 60.0  # of an element without an atomic ion
-_NO_GAS = 20.0  # of H, C, N and O without an atomic ion
+_HEAVY_GASES, _NO_GAS = ("C", "N", "O"), 20.0  # cost of one of these without an atomic ion; H is often in hydrides only
 UNNAMED = 40.0
 """Cost of a peak without a name: so no name may cost more, and peaks without a name bring no wrong ions."""
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
@@ -50,7 +50,8 @@ class IonChoice:
         new = [_NEW_GAS if element_of(e) in GASES else _NEW_COMMON if e in COMMON else _NEW_RARE for e in self.elements]
         free = {name for text in expected for name in atoms_of_formula(text)}
         self._new = np.where(np.array([name in free for name in self.elements], bool), 0.0, new)
-        self._no_atoms = np.where(self._gas, _NO_GAS, _NO_ATOMS)
+        self._no_atoms = np.where(self._gas, 0.0, _NO_ATOMS)
+        self._no_atoms[[at for at, name in enumerate(self.elements) if element_of(name) in _HEAVY_GASES]] = _NO_GAS
         for ion in self._expected_ions:  # the user knows of the molecule
             self._no_atoms[[self._place[name] for name in ion.atoms]] = 0.0
         self.banned: set[str] = set()

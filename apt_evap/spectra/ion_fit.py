@@ -18,6 +18,8 @@ _SHAPE_ERROR = 0.05  # of a place, in standard deviations of a peak
 _READING_ERROR = 2e-4  # of a place [Da]
 _WINDOW = 3.0  # standard deviations of a place
 _UNSEEN = 1.0  # added to the distance of a place without a peak: a peak comes first
+_JOINED = 2.5  # standard deviations of two lines that are one peak
+_OWN_LINE, _OWN_LINES = 0.02, 2  # abundance and number of lines elsewhere, for which an ion may have a part of it
 _MISSED = 0.25  # part of the isotopes of an ion that may have no place in a spectrum
 
 Rows = NDArray[np.int64]
@@ -123,7 +125,16 @@ class IonFit:
             np.add.at(contents, (owner[held], peak[held]), share[held])
             on_peak = held & self.contents.seen[peak]
             np.add.at(shifts, (owner[on_peak], peak[on_peak]), (share * distance)[on_peak])
-            missed = np.bincount(owner, share * ~held, minlength=len(new))
+            # a line beside a peak that it cannot be separated from, of an ion with lines of its own elsewhere: without
+            # a word on its place, which is that of the other ion
+            seen_distance = np.where(
+                inside & self.contents.seen[near], np.abs(np.log(places[:, None] / mass[near])), np.inf
+            )
+            nearest = np.argmin(seen_distance, axis=1)
+            own = np.bincount(owner, on_peak & (share > _OWN_LINE), minlength=len(new)) >= _OWN_LINES
+            joined = ~held & own[owner] & (seen_distance[line, nearest] < _JOINED * self.scale.sigma(places))
+            np.add.at(contents, (owner[joined], near[line, nearest][joined]), share[joined])
+            missed = np.bincount(owner, share * ~(held | joined), minlength=len(new))
         rows = np.hstack([contents / self.error, shifts / (np.maximum(self.contents.ions, 1) * self.place_error)])
         first = len(self.ions)
         self.ions += new

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_kind, check_number, short_text
 from apt_evap.detection.hits import Hits
+from apt_evap.specimen.lattice import atom_density
+from apt_evap.specimen.materials import MATERIALS
 from apt_evap.spectra.candidate_ions import atomic_ions, molecular_ions
 from apt_evap.spectra.composition import MOST_UNEXPLAINED, Amounts, Composition
 from apt_evap.spectra.dead_time import FEWEST_OF_ISOTOPES, DeadTimeLoss, isotope_losses, losses_of
@@ -286,6 +288,7 @@ class Spectrum:
             tuple(formula for _, _, formula in rows),
             np.array([low for low, _, _ in rows]),
             np.array([high for _, high, _ in rows]),
+            volume=np.array([_volume(formula) for _, _, formula in rows]),
             colour=tuple(_PALETTE[formulas.index(formula) % len(_PALETTE)] for _, _, formula in rows),
             composition=tuple(atoms_of_formula(formula) for _, _, formula in rows),
             source="spectrum",
@@ -405,6 +408,15 @@ class _Ranged:
     def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
         """Numbers of ions and their covariance among some ions [Da]."""
         return self._ranged.amounts(mass)
+
+
+def _volume(formula):
+    """Volume of the atoms of an ion in their crystals [nm^3]; NaN where one is not known."""
+    parts = [
+        (number, MATERIALS[name]) if name in MATERIALS else (math.nan, None)
+        for name, number in atoms_of_formula(formula).items()
+    ]
+    return sum(number / (atom_density(m.structure, m.a, m.c) if m else 1.0) for number, m in parts)
 
 
 def _names(ions: Sequence[Ion | None], numbers):

@@ -180,8 +180,11 @@ def simulate(
     run = _evaporated(config, simulation, stored, n_previous, progress)
     seconds = time.perf_counter() - began
     if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
-        note(f"{path} is complete: nothing to do")
-        return Simulated(run, path, None, [], [], seconds)
+        if picture.exists():
+            note(f"{path} is complete: nothing to do")
+            return Simulated(run, path, None, [], [], seconds)
+        note(f"{path} is complete")
+        return _drawn(run, path, picture, config, seconds, note)
     run = config.as_saved(run)
     run.save(path)
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
@@ -190,6 +193,11 @@ def simulate(
     if line := real_units_line(run):
         note(line)
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
+    return _drawn(run, path, picture, config, seconds, note)
+
+
+def _drawn(run, path, picture, config, seconds, note):
+    """Draw the maps of a saved run."""
     from apt_evap.plot.map_figures import specimen_title  # with Matplotlib
 
     try:

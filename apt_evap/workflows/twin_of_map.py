@@ -314,6 +314,7 @@ class Twin:
             return
         start = self._start()
         self._note(str(start.indexing))
+        self._note(start.size_text)
         if not start.indexing.decided:
             text = "the map does not decide: the first candidate is simulated; --pole, --line and --scales help"
             warn(text, MapWarning)

@@ -112,6 +112,8 @@ RUNS = {
     "info": [("info", "run.h5"), ("info", "ions.epos"), ("info", "map.npz")],
     "spectrum": [("spectrum", "ions.epos")],
     "planes": [("planes", "ions.epos")],
+    "clusters": [("clusters", "ions.epos")],
+    "proxigram": [("proxigram", "ions.epos")],
     "composition": [("composition", "ions.epos")],
     "index": [("index", "ions.epos", "--element", "Ni", "--scales", "50,50")],
     "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50")],

@@ -191,7 +191,13 @@ def test_a_law_can_see_the_field_of_the_others(small_tip):
     assert of_others.fields.std() < 0.95 * of_charge.fields.std()
 
 
-@pytest.mark.parametrize("rule", CONSTANT, ids=NAMES)
+@pytest.mark.parametrize(
+    "rule",
+    [
+        pytest.param(rule, id=name, marks=[pytest.mark.slow] * (name != "gaussian"))
+        for rule, name in zip(CONSTANT, NAMES, strict=True)
+    ],
+)
 def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, tmp_path, rule):
     settings = ae.evaporation.ChargeSettings(sweep_interval=15)
 

@@ -1,6 +1,7 @@
 """The page of the explorer in a document without a browser."""
 
 import re
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -817,3 +818,12 @@ def test_a_page_behind_a_proxy(caplog):
         server.stop()
     assert answers == [True, True, 403]
     assert "--allow-origin other.example:8001" in caplog.text
+
+
+def test_a_port_in_use_is_named():
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(ValueError, match=rf"port {port} of 127\.0\.0\.1 cannot be used .*: --port names"):
+            serve(None, port=port)

@@ -96,6 +96,10 @@ def test_the_radius_is_that_of_the_voltage(found):
     # medians of the first and last thousand ions
     assert start.radii == pytest.approx([v / (FIELD_FACTOR * field) for v in (2666.5, 3333.5)], rel=1e-3)
     assert start.simulated_radius <= sum(start.radii) / 2 + 1e-9
+    low, high = start.radii
+    assert start.size_text.startswith(f"simulating R = {start.simulated_radius:.1f} nm, the largest of those not above")
+    assert start.size_text.endswith(f"that of the specimen is {low:.0f} to {high:.0f} nm by its voltages")
+    assert "not known" in ae.fit.settings_of(indexing, minutes=2).size_text
     other = ae.fit.settings_of(indexing, hits, field_factor=2 * FIELD_FACTOR, minutes=2)
     assert other.radii == pytest.approx([radius / 2 for radius in start.radii])
     lens = ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)

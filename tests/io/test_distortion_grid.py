@@ -27,9 +27,9 @@ def test_columns_are_found_by_name(tmp_path):
     "rows, header, words",
     [
         (ROWS, "detectorX,detectorY,gridX,y", "must have the columns detectorX, .*, it has detectorx, .*, y"),
-        ([], "", "it has none"),
-        ([*ROWS[:3], ("a", 1, 2, 3)], None, "row 5 must have numbers, got 'a,1,2,3'"),
-        ([*ROWS[:3], (1, 2, 3)], None, "row 5 must have numbers"),
+        ([], "", "has no numbers, expected a calibration grid"),
+        ([*ROWS[:3], ("a", 1, 2, 3)], None, "line 5: expected a number, got 'a'"),
+        ([*ROWS[:3], (1, 2, 3)], None, "line 5: expected 4 cells, got 3"),
         (ROWS[:4], None, "at least 6 crossings, got 4"),
     ],
 )

@@ -28,6 +28,7 @@ def test_the_width_of_a_step(sigma, before, after):
     assert abs(found.centre - 0.2) < 4 * found.centre_error < 0.5 * sigma
     assert (found.before, found.after) == pytest.approx((before, after), abs=0.03)
     assert found.width / found.sigma == pytest.approx(2.563, abs=1e-3)  # from a table of the normal distribution
+    assert found.width_error / found.sigma_error == pytest.approx(2.563, abs=1e-3)
     z = (found.fraction - found.fitted(found.centres))[[0, -1]] / found.fraction_errors[[0, -1]]
     assert np.abs(z).max() < 4
 

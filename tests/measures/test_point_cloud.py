@@ -51,6 +51,16 @@ def test_the_proxigram_about_the_isosurface_differs_by_the_shift_of_the_surface(
     assert profile.area == pytest.approx(4 * np.pi * (RADIUS - 0.12) ** 2, rel=0.12)
 
 
+def test_ions_beyond_the_rim_of_a_surface_do_not_count():
+    cloud = blurred_ball(4, 20_000)
+    square = ae.measures.TriangleMesh([[-2, -2, 0], [2, -2, 0], [2, 2, 0], [-2, 2, 0]], [[0, 1, 2], [0, 2, 3]])
+    profile = cloud.proxigram(surface=square, reach=1.0, step=0.5)
+    x, y, z = cloud.positions.T
+    above = (np.abs(x) < 2) & (np.abs(y) < 2)
+    assert np.array_equal(profile.atoms.sum(axis=1), np.histogram(z[above], profile.edges)[0])
+    assert profile.area == pytest.approx(16.0)
+
+
 def test_selections_by_regions():
     cloud = blurred_ball(2, 5000)
     ball, layer = ae.specimen.Sphere((0, 0, 0), 2.0), ae.specimen.Layer(-1.0, 1.0)

@@ -1,5 +1,7 @@
 """Signed distances from surfaces of triangles and convex hulls, against boxes, spheres and all triangles."""
 
+import itertools
+
 import numpy as np
 import pytest
 from skimage.measure import marching_cubes
@@ -49,6 +51,23 @@ def test_a_sphere_of_marching_cubes_has_the_distance_of_a_sphere():
     near, on_rim = mesh.nearest(POINTS, reach=0.5)
     assert np.array_equal(np.isfinite(near), np.abs(mesh.distance(POINTS)) <= 0.5) and not on_rim.any()
     assert np.array_equal(near[np.isfinite(near)], mesh.distance(POINTS)[np.isfinite(near)])
+
+
+def test_beyond_a_sharp_corner_is_outside_however_its_sides_are_divided():
+    """The sign at a vertex is that of the angles of its triangles, not of their number."""
+    apex, base = np.array([0.0, 0.0, 3.0]), np.array([[1.0, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0]])
+    along = base[0] + np.linspace(0, 1, 31)[:, None] * (base[1] - base[0])  # one side in 30 thin triangles
+    corners = np.concatenate([[apex], base, along[1:-1]])
+    edge = [1, *range(4, 33), 2]
+    faces = [[0, i, j] for i, j in itertools.pairwise(edge)] + [[0, 2, 3], [0, 3, 1]]
+    faces += [[3, j, i] for i, j in itertools.pairwise(edge)]
+    mesh = ae.measures.TriangleMesh(corners, faces)
+    assert mesh.is_closed and mesh.volume > 0
+    normals = [np.cross(base[i] - apex, base[j] - apex) for i, j in ((0, 1), (1, 2), (2, 0))]
+    normals = [normal / np.linalg.norm(normal) for normal in normals]
+    weights = np.random.default_rng(1).dirichlet([1, 1, 1], 200)  # all directions from the apex that are nearest to it
+    points = apex + 0.3 * weights @ np.array(normals)
+    np.testing.assert_allclose(mesh.distance(points), np.linalg.norm(points - apex, axis=1), atol=1e-12)
 
 
 def test_no_other_triangle_is_nearer():

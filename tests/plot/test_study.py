@@ -285,6 +285,7 @@ def test_a_study_is_a_folded_table_in_a_notebook(study):
     assert shown.startswith("<details>") and str(study.optimum.score) in shown and study.lines()[0][:20] in shown
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
 def test_the_report_of_the_default_objective(small_tip, made_once, tmp_path):
     """A map with a pole is compared after folding, and the report has the name and the numbers of this score."""

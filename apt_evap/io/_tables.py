@@ -1,0 +1,119 @@
+"""Text tables of numbers with a first line of names: columns divided by commas, semicolons, tabs or spaces.
+
+Where commas do not divide the columns, they are decimal commas. Lines may end with LF, CR LF or CR. Lines that begin
+with # are comments; one just before the numbers may have the names.
+"""
+
+import csv
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apt_evap._common.files import FileError
+from apt_evap._common.types import AnyPath, Floats
+from apt_evap.io._texts import read_text
+
+_NUMBER = re.compile(r"[-+]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][-+]?[0-9]+)?|nan|[-+]?inf(inity)?", re.IGNORECASE)
+
+
+def _is_number(cell):
+    return cell == "" or _NUMBER.fullmatch(cell) is not None
+
+
+@dataclass
+class Table:
+    """Cells of a text table."""
+
+    path: str
+    names: list[str]
+    """Names of the columns as in the file; empty if it has none."""
+    comment: list[str]
+    """Words of the comment just before the numbers, as many as there are columns, which may be their names."""
+    numbers: list[int]
+    """Number of the line of each row."""
+    rows: list[list[str]] = field(repr=False)
+    """Cells of each row, as many as the first row has."""
+
+    def floats(self, column: int, what: str = "a number") -> Floats:
+        """Numbers of a column, NaN for an empty cell; a FileError names the line of a cell that is something else."""
+        cells = [row[column] or "nan" for row in self.rows]
+        try:
+            return np.array(cells, dtype=np.float64)
+        except ValueError:
+            for number, cell in zip(self.numbers, cells, strict=True):
+                if not _is_number(cell):
+                    raise FileError(f"{self.path!r}, line {number}: expected {what}, got {cell!r:.60}") from None
+            raise
+
+    def texts(self, column: int) -> NDArray[np.str_]:
+        """Cells of a column as texts."""
+        return np.array([row[column] for row in self.rows])
+
+    def is_numeric(self, column: int) -> bool:
+        """Whether the first cell of a column is a number."""
+        return _is_number(self.rows[0][column])
+
+
+def read_table(path: AnyPath, what: str, at_most: int) -> Table:
+    """Read a text table.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file.
+    what : str
+        Expected content, for messages.
+    at_most : int
+        Largest allowed size [bytes].
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read, has no row of numbers, or a line has more or fewer cells than the first one.
+    """
+    text = read_text(path, what, at_most)
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip(" ;,\t")]
+    comments = [line.lstrip()[1:] for _, line in lines if line.lstrip().startswith("#")]
+    lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
+    if not lines:
+        raise FileError(f"{str(path)!r} has no numbers, expected {what}")
+    divider = _divider(lines[-1][1])
+    cells = _cells([line for _, line in lines], divider)
+    numbers = [number for number, _ in lines]
+    names: list[str] = []
+    comment: list[str] = []
+    if not any(cell and _is_number(cell) for cell in cells[0]):
+        names, cells, numbers = cells[0], cells[1:], numbers[1:]
+    elif comments:
+        words = _cells(comments[-1:], divider if divider and divider in comments[-1] else None)[0]
+        comment = [word.strip(",;") for word in words[: len(cells[0])]]
+    if not cells:
+        raise FileError(f"{str(path)!r} has no numbers, expected {what}")
+    width = len(names) if names and len(names) > len(cells[0]) else len(cells[0])
+    for number, row in zip(numbers, cells, strict=True):
+        if len(row) != width:
+            raise FileError(f"{str(path)!r}, line {number}: expected {width} cells, got {len(row)}")
+    if divider != ",":
+        cells = [[cell.replace(",", ".") if _is_number(cell) else cell for cell in row] for row in cells]
+    return Table(str(path), names, comment, numbers, cells)
+
+
+def _divider(line):
+    """What divides the cells of a line: a semicolon, a tab, a comma, or None for spaces."""
+    for divider in ";\t":
+        if divider in line:
+            return divider
+    decimal = all(map(_is_number, line.split())) and len(line.split()) > 1  # "1,204 -3,377"
+    return "," if "," in line and not decimal else None
+
+
+def _cells(lines, divider):
+    if divider is None:
+        return [line.split() for line in lines]
+    return [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=divider)]

@@ -1,0 +1,49 @@
+"""A cap of fewer than 12 atoms is none, and is refused before the simulation."""
+
+import math
+
+import numpy as np
+import pytest
+
+import apt_evap as ae
+from apt_evap.config.simulation_file import read_config
+from apt_evap.evaporation.cap import FEWEST, measure_cap
+from apt_evap.evaporation.emitter import Emitter
+
+TIP = """
+[tip]
+material = "Ti"
+axis = [0, 0, 1]
+apex_radius = "6 a"
+shank_length = "6 a"
+shank_angle = 1.5
+[simulation]
+ions = 100
+[real_units]
+field_reference = "{}"
+"""
+
+
+@pytest.mark.parametrize(("name", "radius"), [("Ti", 5.0), ("Zr", 5.0), ("Mg", 5.0), ("Ti", 6.0), ("Be", 6.0)])
+def test_a_facet_is_no_cap(name, radius):
+    """The rounds end with 0 to 11 atoms on the facet: before, a field of 0, or 747 V/nm and a radius of 0.43 nm."""
+    metal = ae.material(name)
+    tip = ae.Tip(metal, apex_radius=radius * metal.a, axis=(0, 0, 1), shank_length=6 * metal.a, shank_angle=1.5)
+    assert all(map(math.isnan, Emitter(tip).cap))
+
+
+def test_the_result_of_the_rounds_is_checked(rng):
+    """The fit moves so far down that fewer atoms are around the axis than before."""
+    angle = np.linspace(0, 2 * np.pi, FEWEST, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(FEWEST)], axis=1) + 1e-3 * rng.normal(size=(FEWEST, 3))
+    normals = np.tile([0.0, 0.0, 1.0], (FEWEST, 1))
+    assert math.isnan(measure_cap(ring, normals, np.ones(FEWEST), np.ones(FEWEST)).ratio)
+
+
+def test_a_tip_without_a_cap_is_refused_before_the_simulation(tmp_path):
+    path = tmp_path / "t.toml"
+    path.write_text(TIP.format("cap"))
+    with pytest.raises(ae.FileError, match=r"t\.toml', \[real_units\]: field_reference = .cap. needs at least 12"):
+        read_config(path).simulation(n_threads=1)
+    path.write_text(TIP.format("site"))
+    read_config(path).simulation(n_threads=1)
