@@ -42,7 +42,8 @@ class UploadHandler(RequestHandler):
             raise HTTPError(403)
         connection: Any = self.request.connection
         connection.set_max_body_size(_LARGEST)
-        name = self.get_query_argument("name")
+        # as it was sent: Tornado would take control characters and spaces out of it
+        name = self.request.query_arguments.get("name", [b""])[-1].decode(errors="replace")
         self._path = Path(name)
         is_plain = name == self._path.name and name not in ("", ".", "..") and "\\" not in name and name.isprintable()
         if not is_plain or len(os.fsencode(name)) > _LONGEST:

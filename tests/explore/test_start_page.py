@@ -1,6 +1,7 @@
 """The start page of the explorer: files of the folder, files that were opened last, an example, and a dropped file."""
 
 import time
+from asyncio import sleep
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -160,3 +161,49 @@ def test_a_dropped_file_is_put_into_the_folder(folder):
     assert [code for code, _ in answers[12:]] == [403, 403]
     assert {path.name for path in folder.iterdir()} == before | {"new.epos"}
     assert not (folder.parent / "up.epos").exists() and not (folder / "inside" / "up.epos").exists()
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_a_dropped_file_replaces_none_that_appears_meanwhile(folder):
+    """Nor the one of a second drop of this name; names that no file can have, or that a link has, are refused."""
+    server, url = serve(None, with_file=lambda path: (None, None))
+    base, session = url.split("/?bokeh-session-id=")
+    (folder / "link.epos").symlink_to(folder / "nowhere.epos")
+    answers = []
+
+    async def send(name, between=None):
+        async def body(write):
+            await write(b"A" * 220)
+            if between is not None:
+                await between()
+            await write(b"A" * 220)
+
+        query = urlencode({"bokeh-session-id": session, "name": name})
+        headers = {"Content-Length": "440"}
+        request = HTTPRequest(f"{base}/upload?{query}", method="POST", body_producer=body, headers=headers)
+        try:
+            answer = await AsyncHTTPClient().fetch(request)
+        except HTTPClientError as error:
+            answer = error.response
+        answers.append((answer.code, answer.body.decode()))
+
+    async def appear():
+        await sleep(0.2)  # the first half has arrived
+        (folder / "mine.epos").write_bytes(b"MINE")
+
+    async def visit():
+        await send("mine.epos", appear)
+        await send("twice.epos", lambda: send("twice.epos"))
+        for name in ("a" * 300 + ".epos", "ä" * 130 + ".epos", "a\nb.epos", "a\0b.epos", "link.epos"):
+            await send(name)
+
+    try:
+        server.io_loop.run_sync(visit)
+    finally:
+        server.stop()
+    assert answers[0][0] == 409 and "exists" in answers[0][1] and (folder / "mine.epos").read_bytes() == b"MINE"
+    assert [code for code, _ in answers[1:3]] == [200, 409] and (folder / "twice.epos").read_bytes() == b"A" * 440
+    assert [code for code, _ in answers[3:]] == [409] * 5
+    assert all(text and "Traceback" not in text and len(text.splitlines()) == 1 for _, text in answers[3:])
+    assert not (folder / "nowhere.epos").exists()
+    assert not [path.name for path in folder.iterdir() if path.name.endswith(".part")]

@@ -126,3 +126,12 @@ def test_parts_must_follow_one_another(run, parts):
 def test_what_is_no_parts_is_refused(parts, message):
     with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         Run.join(parts)
+
+
+def test_masked_rows_are_refused(run20):
+    """As by `Hits`: a row that is masked is neither selected nor left out."""
+    mask = np.arange(len(run20)) % 2 == 0
+    for rows in (np.ma.array(~mask, mask=mask), np.ma.array(np.arange(3), mask=[False, True, False])):
+        with pytest.raises(ValueError, match="rows"):
+            run20[rows]
+    assert len(run20[np.ma.array(mask)]) == mask.sum()

@@ -67,6 +67,16 @@ def test_a_simulated_file_is_extended_and_nobody_elses_is_replaced(folder):
     assert len(ae.simulate("small.toml", overwrite=True, ions=5, progress=False).run) == 5
 
 
+def test_a_finished_run_without_its_picture_gets_it(folder):
+    """The same command gives the same files, wherever it was killed."""
+    first = ae.simulate("small.toml", ions=20, progress=False)
+    picture = first.picture.read_bytes()
+    first.picture.unlink()
+    again = ae.simulate("small.toml", ions=20, resume=True, progress=False)
+    assert again.picture.read_bytes() == picture and len(again.run) == 20
+    assert ae.simulate("small.toml", ions=20, resume=True, progress=False).picture is None
+
+
 @NO_PICTURES
 def test_what_to_know_about_a_run_is_a_warning(folder):
     Path("small.toml").write_text(SMALL + "responses = false\n[responses]\nheight = 0.1\n[detector]\nwidth = 300\n")
