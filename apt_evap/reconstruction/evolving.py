@@ -19,13 +19,14 @@ from numpy.typing import ArrayLike
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, did_you_mean
 from apt_evap.detection.hits import Hits
-from apt_evap.reconstruction.beyond_view import Continuation, Feature, continued
+from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
 from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence, SurfacePass
 from apt_evap.reconstruction.local_composition import (
     SoluteContrast,
     contents,
     local_composition,
+    local_share,
     noise_free_slopes,
     solute_contrast,
 )
@@ -42,8 +43,14 @@ EMISSION_GATE = 0.30
 """Largest contrast of the density on the detector, of the most even fifth of the ions: 0.16 to 0.23 at rest or with the
 rolling of aluminium, 0.36 to 0.43 if all ions roll, and then the surface is no better than the cap."""
 
+VOLTAGE_GATE = 0.02
+"""Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
+a layer of 1.15 times the field across the whole specimen."""
+
+_WINDOW = 0.65  # of the radius: depth in which the trend is a straight line
+_FIRST_SHAPE = 0.065  # of the radius
 _PASSES = 7  # with voltage and phases after the first: fields change by less than 0.005 in the last
-_ION_LIMIT = 150_000  # in these passes; of more ions, every n-th
+_ION_LIMIT = 60_000  # in these passes; of more ions, every n-th
 _SMOOTHING = 1 / 87  # of the radius: depth over which the voltage is averaged, 0.15 nm of R = 13 nm
 _SPIN_UP = 0.05  # of the ions, from which nothing is measured: the first shape is not known
 _CLEAN = 0.02  # of the ions of a block: largest share of phases in a stretch of matrix
@@ -429,7 +436,13 @@ def _relative_voltages(hits, ions):
     if np.ptp(total) <= _CONSTANT * total.mean():
         return None, f"a constant voltage of {total[0]:g} V"
     width = _SMOOTHING * ions.radius / ions.depths[-1] * len(total)
-    smooth = scipy.ndimage.gaussian_filter1d(total, max(width, 1.0), mode="nearest")
+    # of means of blocks, an eighth as wide: a Gaussian over 10,000 ions at each of a million takes a minute
+    size = max(1, int(width / 8))
+    starts = np.arange(0, len(total), size)
+    sizes = np.diff(np.append(starts, len(total)))
+    means = np.add.reduceat(total, starts) / sizes
+    means = scipy.ndimage.gaussian_filter1d(means, max(width / size, 1.0), mode="nearest")
+    smooth = np.interp(np.arange(len(total)), starts + (sizes - 1) / 2, means)
     return smooth / smooth.mean(), ""
 
 
@@ -451,6 +464,12 @@ def _fixed_point(measured):
         positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
     )  # fmt: skip
     if not seen:
+        swing = _voltage_swing(measured)
+        if swing > VOLTAGE_GATE:
+            return (
+                f"the voltage changes by {swing:.1%} about its trend, as by a phase at the rim of the field of view, "
+                "and neither labels nor solutes show one"
+            )
         return nothing
     names = tuple(names[k] for k in seen)
     compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
@@ -470,8 +489,9 @@ def _fixed_point(measured):
     level = _level(voltages, ring.fields, features, n)
     found = surface.integrate(voltages / level, _ion_fields(features), recession="mean")
     errors = np.zeros(len(own))
+    compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
     for _ in range(_PASSES):
-        compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
+        features = [replace(one, ratio=float(ratios[k])) for one, k in zip(features, seen, strict=True)]
         outside, ways = continued(features, found.positions, ions.in_ring)
         before, thresholds = found.positions, _ion_fields(features)
         found = surface.integrate(voltages / level, thresholds, outside, "surface")
@@ -481,7 +501,28 @@ def _fixed_point(measured):
         new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
         ratios = ratios.copy()
         ratios[seen] = np.clip(new, *_FIELD_LIMITS)
+    if rough := [way for way in ways if way.way == "ring"]:
+        flatness = max(way.flatness for way in rough)
+        return (
+            f"a phase reaches the rim of the field of view, {max(way.share for way in rough):.2f} of the ring, "
+            f"and is not flat: its thickness is {flatness:.2f} of its extent, above {FLAT_GATE:g}"
+        )
     return _Fixed("surface", level, trend, features, contrasts, thresholds, before, ways, ratios, errors)
+
+
+def _voltage_swing(measured):
+    """Largest range of the voltage about a straight line in windows of the depth, without the first shape."""
+    if measured.voltages is None:
+        return 0.0
+    depths = measured.ions.depths[1:] / measured.ions.radius
+    later = depths > _FIRST_SHAPE
+    depths, voltages = depths[later], measured.voltages[later]
+    swings = [0.0]
+    for window in np.array_split(np.arange(len(depths)), max(1, round(float(np.ptp(depths)) / _WINDOW))):
+        line = np.polyval(np.polyfit(depths[window], voltages[window], 1), depths[window])
+        low, high = np.quantile(voltages[window] / line, (0.01, 0.99))
+        swings.append(float(high - low))
+    return max(swings)
 
 
 def _features(measured, seen, contrasts, halves, positions, ratios):
@@ -563,7 +604,7 @@ def _found_fields(measured, features, compositions, values, positions):
     cores = []
     if measured.has_labels:
         for one in features:
-            near = local_composition(positions, one.own, later, _CORE, measured.ions.volume).all
+            near = local_share(positions, one.own, _CORE, measured.ions.volume)
             for share in _CORE_SHARES:
                 core = one.own & (near >= share)
                 if core.sum() > 100:

@@ -69,8 +69,7 @@ _LINES = {  # of nickel [111]; there are three of each kind
 }
 _TURNS = (0, 120, 240)  # [degrees]
 _PROFILE_BINS = 30
-_MOST_BINS = 96  # of a measured map: the grid of figure 4 has 180 points
-_CERTAIN = 3.0  # errors: a difference that is not chance
+_CHANCE, _CERTAIN = 2.0, 3.0  # errors: a difference that may be chance, and one that is not
 _TWINS = (
     "The experiments of the paper are not public. The measured map is that of a twin: another specimen, with other "
     "random numbers and the energies of the paper. So the figure shows that the method finds hidden energies, not that "
@@ -105,7 +104,10 @@ class PaperClaim:
         return f"{self.verdict[0].upper()}{self.verdict[1:]}: {self.claim} Here: {self.here}"
 
 
-def _judged(claim, holds, here):
+def _judged(claim, holds, here, study=None):
+    """A claim with its verdict; a study of a measured map judges only if the maps are alike."""
+    if study is not None and study.likeness.verdict != "alike":
+        return PaperClaim(claim, OPEN, f"{here} {'; '.join(study.lines())}.")
     return PaperClaim(claim, AGREES if holds else DIFFERS, here)
 
 
@@ -297,12 +299,13 @@ def _point(study):
     return f"{best.mean:g} eV, σ/mean {best.relative_spread:g}{fraction}"
 
 
-def _clear_maximum(study, name):
+def _clear_maximum(study, name, is_twin):
     """Whether the best score is above the median of the grid by more than chance."""
     best, middle = study.optimum.score, float(np.median(study.scores))
     holds = best.value - middle > _CERTAIN * np.nan_to_num(best.error)
     text = f"{name}, {study.grid.name}: best {best.value:.2f} ± {best.error:.2f}, median of the grid {middle:.2f}."
-    return _judged("the similarity has a clear maximum over mean and width of the energy.", bool(holds), text)
+    claim = "the similarity has a clear maximum over mean and width of the energy."
+    return _judged(claim, bool(holds), text, None if is_twin else study)
 
 
 def _is_at(study, case, fraction=None):
@@ -330,13 +333,13 @@ def _figure_3(fits: Sequence[tuple[_Fitted, str]], case_of: Mapping[str, PaperCa
     for ax, (fitted, mechanism, study) in zip(figure.subplots(1, 2), studies, strict=True):
         plot.score_matrix(study, [ax])
         ax.set_title(f"{fitted.name}, {mechanism}")
-        claims.append(_clear_maximum(study, fitted.name))
+        claims.append(_clear_maximum(study, fitted.name, is_twin))
         if case := case_of.get(mechanism):
             claim = f"the optimum of {case.element} is {case.mean:g} eV, σ/mean {case.relative_spread:g}."
             if is_twin:
                 claims.append(PaperClaim(claim, OPEN, _recovered(case, study)))
             else:
-                claims.append(_judged(claim, _is_at(study, case), f"{_point(study)}. {' '.join(study.lines())}."))
+                claims.append(_judged(claim, _is_at(study, case), f"{_point(study)}.", study))
     if is_twin:
         al, ni = (study.plain["optimum"] for _, _, study in studies)
         text = f"uncorrected for noise {al.value:.2f} and {ni.value:.2f}, but both maps are simulated by one program."
@@ -350,12 +353,12 @@ def _figure_4(fitted: _Fitted, is_twin: bool, is_nickel: bool):
     """Scores of combined emission for five fractions of the energy that go into the roll-up."""
     study = fitted.study("combined")
     best = study.optimum
-    claims = [_clear_maximum(study, fitted.name)]
+    claims = [_clear_maximum(study, fitted.name, is_twin)]
     claim = "with 25 % of the energy of nickel in random directions the similarity is a little higher."
     if is_twin:
         claims.append(PaperClaim(claim, OPEN, _recovered(NICKEL, study, fraction=1.0)))
     elif is_nickel:
-        claims.append(_judged(claim, best.rollup_fraction == 0.75, f"{_point(study)}. {' '.join(study.lines())}."))
+        claims.append(_judged(claim, best.rollup_fraction == 0.75, f"{_point(study)}.", study))
     figure = plot.score_matrix(study)[0].figure
     title = f"{fitted.name}: similarity for five fractions of the energy that go into the roll-up."
     return figure, PaperFigure(4, title, tuple(claims), _TWINS if is_twin else _OWN, {"combined": study.to_dict()})
@@ -378,7 +381,12 @@ def _figure_of_maps(number: int, fitted: _Fitted, case: PaperCase | None, mechan
         f"{fitted.name}: unperturbed {unperturbed.value:.2f}, with {mechanism} {best.score.value:.2f}, gain {gain}."
     )
     claims = [
-        _judged("with the best energies the map is much closer to the measured one than without.", closer, scores)
+        _judged(
+            "with the best energies the map is much closer to the measured one than without.",
+            closer,
+            scores,
+            None if case else study,
+        )
     ]
     if mechanism == "roll-up" and (case is not None or fitted.name.startswith("Ni")):
         bare, rolled = (study.compared(study.maps[name]) for name in ("unperturbed", "optimum"))
@@ -420,10 +428,11 @@ def _figure_7(sharp: Run, blunt: Run, radii: tuple[int, int]):
             "degrees_of_freedom": comparison.degrees_of_freedom,
         }
         widths = " and ".join(f"{line.width:.1f} ± {line.width_error:.1f} mm" for line in lines)
+        errors = abs(ratio - 1) / error
         claims.append(
-            _judged(
+            PaperClaim(
                 f"the {kind} line is as wide for the blunt tip as for the sharp one.",
-                bool(abs(ratio - 1) < _CERTAIN * error),
+                AGREES if errors < _CHANCE else DIFFERS if errors > _CERTAIN else OPEN,
                 f"{widths} at {' and '.join(names)}, ratio {ratio:.2f} ± {error:.2f}; a pattern of fixed size on the "
                 f"specimen would give {radii[0] / radii[1]:.2f}.",
             )
@@ -496,8 +505,7 @@ class PaperOfMap:
     """Figures 3 to 6 of a measured map, which takes the place of the twins."""
 
     def __init__(self, made: Twin, element: str, *, threads: int | None, progress: Any) -> None:
-        bins = len(made.measured_map.values)
-        settings = FitSettings(bins=min(bins, _MOST_BINS), resamples=QUICK.resamples, objective="similarity")
+        settings = FitSettings(resamples=QUICK.resamples, objective="similarity")
         registration = made.registration
         name = f"{element}, measured"
         self._fitted = _Fitted(name, made.run, made.measured_map, settings, threads, progress, registration)

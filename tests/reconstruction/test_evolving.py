@@ -157,3 +157,18 @@ def test_the_picture_has_both_sections_and_three_fields():
     np.testing.assert_allclose(found.cap_positions, cap.positions, atol=1e-12)
     with pytest.raises(ValueError, match="must have a surface that was followed"):
         ae.plot.surface_history(evolving(ions_of(50)[0]))
+
+
+def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
+    bump = 3000.0 * (1 + 0.08 * np.exp(-(((np.arange(8000) - 5000) / 1000) ** 2)))
+    assert evolving(ions_of(8000, voltage=bump)[0]).verdict.startswith("cap: the voltage changes by")
+    rise = 3000.0 * (1 + 0.3 * np.arange(8000) / 8000)
+    assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
+
+
+def test_a_phase_at_the_rim_that_is_not_flat_is_left_to_the_cap():
+    hits, _ = ions_of(8000, voltage=varying(8000))
+    places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
+    ball = np.linalg.norm(places - (5.5, 0.0, places[:, 2].mean()), axis=1) < 1.0
+    found = evolving(hits, labels=ball.astype(int))
+    assert found.verdict.startswith("cap: a phase reaches the rim") and "is not flat" in found.verdict

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,6 +88,16 @@ def test_a_caption_has_claims_and_limits():
         "Figure 5. Maps.", "Agrees: lines are wide. Here: 1 mm.", "Cannot be shown: 0.1 eV. Here: hidden.",
         "One specimen.\n",
     ]  # fmt: skip
+
+
+def test_a_map_that_is_not_alike_judges_no_claim():
+    study = SimpleNamespace(
+        likeness=SimpleNamespace(verdict="doubtful"), lines=lambda: ["doubtful that maps are alike"]
+    )
+    claim = figures_of_paper._judged("0.155 eV.", True, "0.3 eV.", study)
+    assert (claim.verdict, claim.here) == (OPEN, "0.3 eV. doubtful that maps are alike.")
+    study.likeness.verdict = "alike"
+    assert figures_of_paper._judged("0.155 eV.", True, "0.3 eV.", study).verdict == AGREES
 
 
 def test_what_is_refused(folder, capsys):

@@ -2,7 +2,7 @@
 
 **Halves.** In each of eight half discs the evidence of the local contrast is computed for all orientations at the scale
 of the winner. Where another orientation has more evidence than the winner, and than no crystal (0), the map may hold a
-second lattice. A half without evidence is no second lattice.
+second lattice. A half without evidence is no second lattice, unless the whole map is clear.
 
 **Surrogates.** A surrogate of a map has the same harmonics of every ring, but each harmonic with a random phase, the
 same for all rings and for counts and contrast. Rings, radial changes and the width of lines stay; what belongs to one
@@ -41,8 +41,10 @@ _POLAR_RINGS, _POLAR_AZIMUTHS = 48, 192  # of the counts: about the bins of the 
 _FILLED = 1.5  # bins: smoothing of what fills the corners of a map
 
 
-def second_lattice(view: View, terms: Terms, fit: Refined) -> float:
-    """Largest evidence of another orientation over that of the winner, or of no crystal, in any half of a map.
+def second_lattice(view: View, terms: Terms, fit: Refined) -> tuple[float, float]:
+    """Evidence of the local contrast for a second lattice, and that of the winner in the half where it has least.
+
+    The first one is the largest evidence of another orientation over that of the winner, or of no crystal, in any half.
 
     Parameters
     ----------
@@ -56,7 +58,8 @@ def second_lattice(view: View, terms: Terms, fit: Refined) -> float:
     windows = _windows()
     pictures = _in_windows(view.picture, windows)
     winner = _of_winner(view, terms, fit, windows, pictures)
-    return float((_of_others(view, terms, fit, windows, pictures) - np.maximum(winner, 0)).max())
+    excess = _of_others(view, terms, fit, windows, pictures) - np.maximum(winner, 0)
+    return float(excess.max()), float(winner.min())
 
 
 def _windows():
