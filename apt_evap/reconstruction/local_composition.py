@@ -15,8 +15,9 @@ CONTRAST_GATE = 3.0
 
 _FEWEST, _MOST = 30, 250  # neighbours for a composition
 _NEIGHBOURS = 60  # for the contrast
-_CELLS = 4_000_000  # largest grid
+_CELLS = 1_500_000  # largest grid
 _CORE = 0.5  # of the ions in the richer half, that are taken for its core
+_LEAST = 1e-9
 _TURNS = 60  # of the mixture of two binomials
 _SHARPNESS = 2.1  # cells per standard deviation of the Gaussian; wider cells would blur
 
@@ -81,6 +82,22 @@ def local_composition(
     -------
     LocalComposition
     """
+    choices = [halves, halves & solute, ~halves, ~halves & solute]
+    ions, ours, others, theirs = _counted(positions, choices, neighbours, volume)
+    return LocalComposition(
+        (ours + theirs) / np.maximum(ions + others, _LEAST), ours / np.maximum(ions, _LEAST),
+        theirs / np.maximum(others, _LEAST),
+    )  # fmt: skip
+
+
+def local_share(positions: Floats, chosen: Booleans, neighbours: int, volume: float) -> Floats:
+    """Fraction of chosen ions about each ion, as in `local_composition`, shape (n,)."""
+    ions, ours = _counted(positions, [np.ones(len(chosen), bool), chosen], neighbours, volume)
+    return ours / np.maximum(ions, _LEAST)
+
+
+def _counted(positions, choices, neighbours, volume):
+    """Ions of each choice within the Gaussian about each ion, in units of a cell."""
     # n ions count as many as those of a Gaussian of standard deviation s: n = (2 sqrt(pi) s)^3 / volume
     scale = (neighbours * volume) ** (1 / 3) / math.sqrt(4 * math.pi)
     low = positions.min(axis=0) - 2 * scale
@@ -92,17 +109,11 @@ def local_composition(
     # the cells add a variance of 1/12, and the interpolation between them 1/6
     width = math.sqrt(max((scale / cell) ** 2 - 1 / 4, 0.01))
     counts = []
-    for half in (halves, ~halves):
-        for chosen in (half, half & solute):
-            count = np.bincount(flat[chosen], minlength=int(shape.prod())).reshape(shape).astype(np.float32)
-            smooth = scipy.ndimage.gaussian_filter(count, width, truncate=3.0)
-            counts.append(scipy.ndimage.map_coordinates(smooth, (places - 0.5).T, order=1, output=np.float64))
-    ions, ours, others, theirs = counts
-    least = 1e-9
-    return LocalComposition(
-        (ours + theirs) / np.maximum(ions + others, least), ours / np.maximum(ions, least),
-        theirs / np.maximum(others, least),
-    )  # fmt: skip
+    for chosen in choices:
+        count = np.bincount(flat[chosen], minlength=int(shape.prod())).reshape(shape).astype(np.float32)
+        smooth = scipy.ndimage.gaussian_filter(count, width, truncate=3.0)
+        counts.append(scipy.ndimage.map_coordinates(smooth, (places - 0.5).T, order=1, output=np.float64))
+    return counts
 
 
 def solute_contrast(positions: Floats, solute: Booleans, halves: Booleans, volume: float) -> SoluteContrast:

@@ -42,8 +42,6 @@ class Explanation:
     chosen: list[int]
     amplitudes: Floats
     covariance: Floats
-    losses: Floats
-    """By how much chi-squared and costs rise without each ion."""
     others: list[list[int]]
     """Ions that could be in place of each."""
     sets: list[tuple[list[int], Floats]] = field(default_factory=list)
@@ -89,7 +87,7 @@ class Explainer:
         if self.allowed is not None and not self.allowed:  # nothing is left to name
             fit = IonFit(contents, self.peaks.scale, self.calibration, self.abundances, _SHAPE, _WINDOWS[-1])
             none = np.zeros(0)
-            return Explanation(contents, self.calibration, fit, [], none, np.zeros((0, 0)), none, [])
+            return Explanation(contents, self.calibration, fit, [], none, np.zeros((0, 0)), [])
         choice = self._choice(contents, _WINDOWS[0])
         ions = atomic_ions(choice.elements)
         self._anchors = find_anchors(contents, self.peaks.scale, self.abundances, ions)
@@ -317,10 +315,9 @@ class Explainer:
         kept = [number for number, x in zip(chosen, amplitudes, strict=True) if x > 0]
         amplitudes = amplitudes[amplitudes > 0]
         fit = choice.fit
-        losses = [fit.solve(r)[1] + choice.cost(r) - value for r in ([n for n in kept if n != m] for m in kept)]
         final, covariance = self.amounts(fit, kept)
         explanation = Explanation(
-            contents, self.calibration, fit, kept, final, covariance, np.array(losses), [], [], either, perhaps
+            contents, self.calibration, fit, kept, final, covariance, [], [], either, perhaps
         )  # fmt: skip
         tried = choice.candidates(kept, amplitudes)
         for number in kept:

@@ -69,7 +69,7 @@ _LINES = {  # of nickel [111]; there are three of each kind
 }
 _TURNS = (0, 120, 240)  # [degrees]
 _PROFILE_BINS = 30
-_CERTAIN = 3.0  # errors: a difference that is not chance
+_CHANCE, _CERTAIN = 2.0, 3.0  # errors: a difference that may be chance, and one that is not
 _TWINS = (
     "The experiments of the paper are not public. The measured map is that of a twin: another specimen, with other "
     "random numbers and the energies of the paper. So the figure shows that the method finds hidden energies, not that "
@@ -428,10 +428,11 @@ def _figure_7(sharp: Run, blunt: Run, radii: tuple[int, int]):
             "degrees_of_freedom": comparison.degrees_of_freedom,
         }
         widths = " and ".join(f"{line.width:.1f} ± {line.width_error:.1f} mm" for line in lines)
+        errors = abs(ratio - 1) / error
         claims.append(
-            _judged(
+            PaperClaim(
                 f"the {kind} line is as wide for the blunt tip as for the sharp one.",
-                bool(abs(ratio - 1) < _CERTAIN * error),
+                AGREES if errors < _CHANCE else DIFFERS if errors > _CERTAIN else OPEN,
                 f"{widths} at {' and '.join(names)}, ratio {ratio:.2f} ± {error:.2f}; a pattern of fixed size on the "
                 f"specimen would give {radii[0] / radii[1]:.2f}.",
             )

@@ -178,7 +178,8 @@ class Twin:
         self.folder = folder
         self._source, self._options, self._threads = source, options, threads
         self._progress, self._note, self._command = progress, note, command
-        made_from = source.made_from() | options.to_plain()
+        chosen = options.to_plain()  # first: a difference of the element is named before that of its peaks
+        made_from = {**chosen, **source.made_from(), **chosen}
         self._kept = KeptFiles(folder, made_from, (SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER))
 
     # ---- results -----------------------------------------------------------------------------------------------------
