@@ -39,10 +39,9 @@ FEWEST_IONS = 2000
 WIDEST_VIEW = 60.0
 """Largest half angle of the field of view [degrees]: beyond, the response of a sphere does not describe a specimen."""
 
-EMISSION_GATE = 0.30
-"""Largest contrast of the density on the detector, of the most even fifth of the ions: 0.16 to 0.23 at rest or with the
-rolling of aluminium, 0.36 to 0.43 if all ions roll, and then the surface is no better than the cap."""
-
+EMISSION_GATE = 0.33
+"""Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 at rest or with the rolling of aluminium,
+0.37 to 0.47 if all ions roll, and then the surface is no better than the cap."""
 VOLTAGE_GATE = 0.02
 """Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
 a layer of 1.15 times the field across the whole specimen."""
@@ -61,6 +60,7 @@ _ION_LIMITS = 0.4, 2.5
 _CORE = 25  # neighbours for the core of a phase
 _CORE_SHARES = 0.92, 0.8, 0.6, 0.0  # of them: the first that leaves 100 ions
 _DENSITY_WIDTH = math.radians(3.0)  # of the Gaussian of the density on the detector
+_FOREIGN = 0.1  # of the ions of a cell: most that may be of another phase
 _DENSITY_BINS = 61
 _DENSITY_IONS = 5000  # of a block: its noise is 0.07
 _CONSTANT = 1e-6  # relative spread of a voltage that does not change
@@ -329,11 +329,6 @@ def follow_surface(
     measured = _Measured(ions, voltages, names, own, labels is not None)
     every = -(-len(cap) // _ION_LIMIT)
     thinned = measured.part(0, every) if every > 1 else measured
-    contrast = _density_contrast(thinned)
-    if contrast > EMISSION_GATE:
-        return _as_cap(
-            cap, f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
-        )
     fixed = _fixed_point(thinned)
     if isinstance(fixed, str):
         return _as_cap(cap, fixed + (f" ({why})" if why else ""))
@@ -382,26 +377,35 @@ def _phases_of(hits, rows, n, ranges, solutes, labels):
     return names, tuple(own[name] for name in names)
 
 
-def _density_contrast(measured):
-    """Standard deviation of the density of the matrix over the field of view, without the noise of the counts."""
-    ions, matrix = measured.ions, np.ones(len(measured.ions.directions), bool)
-    if measured.has_labels:
-        matrix = ~np.any(measured.own, axis=0)
+def _density_contrast(ions, others=None):
+    """Contrast of the density of the matrix on the detector, without the noise of the counts.
+
+    A precipitate changes the density of its cells and blocks, rolling that of all. Cells with other ions are left out,
+    and the median of blocks of the sequence is taken; with no phase known, the most even block.
+    """
     rim = math.sin(ions.rim)  # an even flux is even in x / R and y / R
     edges = np.linspace(-1.02 * rim, 1.02 * rim, _DENSITY_BINS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     inside = centres[:, None] ** 2 + centres**2 < rim**2
     width = _DENSITY_WIDTH / (edges[1] - edges[0])
     seen = np.maximum(scipy.ndimage.gaussian_filter(inside.astype(float), width), 0.05)
+    n = len(ions.directions)
     contrasts = []
-    # A precipitate changes the density of some blocks, rolling that of all: a sphere has 0.35 in all ions together.
-    places = ions.directions[matrix, :2]
-    for block in np.array_split(places, int(np.clip(len(places) // _DENSITY_IONS, 1, 5))):
-        counts = np.histogram2d(*block.T, bins=(edges, edges))[0]
-        density = (scipy.ndimage.gaussian_filter(counts, width) / seen)[inside]
+    for rows in np.array_split(np.arange(n), int(np.clip(n // _DENSITY_IONS, 1, 5))):
+        places = ions.directions[rows, :2]
+        counts = np.histogram2d(*places.T, bins=(edges, edges))[0]
+        smooth, cells = scipy.ndimage.gaussian_filter(counts, width), inside
+        if others is not None:
+            foreign = np.histogram2d(*places[others[rows]].T, bins=(edges, edges))[0]
+            cells = inside & (scipy.ndimage.gaussian_filter(foreign, width) < _FOREIGN * smooth)
+            if np.count_nonzero(cells) < 0.25 * np.count_nonzero(inside):
+                continue
+        density = (smooth / seen)[cells]
         noise = np.count_nonzero(inside) / max(counts.sum(), 1) / (4 * math.pi * width**2)
         contrasts.append(math.sqrt(max(0.0, density.var() / max(density.mean(), 1e-12) ** 2 - noise)))
-    return min(contrasts)
+    if others is None:
+        return min(contrasts)
+    return float(np.median(contrasts)) if contrasts else _density_contrast(ions)
 
 
 def _as_cap(cap, reason):
@@ -454,7 +458,6 @@ def _fixed_point(measured):
     ring = surface.integrate()
     halves = np.random.default_rng(0).integers(0, 2, n).astype(bool)
     contrasts: list[SoluteContrast] = []
-    names = measured.names
     if not measured.has_labels:
         contrasts = [solute_contrast(ring.positions, one, halves, ions.volume) for one in own]
     seen = [k for k in range(len(own)) if measured.has_labels or contrasts[k].is_seen]
@@ -463,6 +466,11 @@ def _fixed_point(measured):
         way="ring", level=1.0, trend=np.array([1.0, 0.0]), features=[], contrasts=contrasts, fields=np.ones(n),
         positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
     )  # fmt: skip
+    compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
+    others = np.any([one.members for one in features], axis=0) if features else None
+    contrast = _density_contrast(ions, others)
+    if contrast > EMISSION_GATE:
+        return f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
     if not seen:
         swing = _voltage_swing(measured)
         if swing > VOLTAGE_GATE:
@@ -471,8 +479,6 @@ def _fixed_point(measured):
                 "and neither labels nor solutes show one"
             )
         return nothing
-    names = tuple(names[k] for k in seen)
-    compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
     _, ways = continued(features, ring.positions, ions.in_ring)
     reaches = [way for way in ways if way.way != "none"]
     if measured.voltages is None:
