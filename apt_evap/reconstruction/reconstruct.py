@@ -106,7 +106,7 @@ def reconstruct(
     chosen = check_choice(shape, "shape", SHAPES)
     if chosen == "cap":
         for name, value in (("solutes", solutes), ("labels", labels)):
-            if value is not None and len(value):  # type: ignore[arg-type]
+            if value is not None and not (isinstance(value, tuple | list) and not value):
                 raise ValueError(f'{name} are for shape="evolving", got {name} and shape="cap"')
         return cap_reconstruction(hits, resolved_settings(settings, constants), origins)[0]
     if origins is not None:
