@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from apt_evap._common.validation import check_choice, check_kind
+from apt_evap._common.validation import check_choice, check_kind, short_text
 from apt_evap.detection.hits import Hits
 from apt_evap.reconstruction.evolving import follow_surface
 from apt_evap.reconstruction.origins import OriginTable
@@ -107,7 +107,7 @@ def reconstruct(
     if chosen == "cap":
         for name, value in (("solutes", solutes), ("labels", labels)):
             if value is not None and not (isinstance(value, tuple | list) and not value):
-                raise ValueError(f'{name} are for shape="evolving", got {name} and shape="cap"')
+                raise ValueError(f'{name} are for shape="evolving", got {short_text(value)} and shape="cap"')
         return cap_reconstruction(hits, resolved_settings(settings, constants), origins)[0]
     if origins is not None:
         raise ValueError('origins must be None with shape="evolving", whose positions a table of a sphere would move')
