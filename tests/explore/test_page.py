@@ -642,7 +642,7 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
 def test_candidates_of_a_search_are_those_of_its_ions():
     """Other ions, on the same page or in a file of the same name, have none; marks and their fits are kept."""
     rng = np.random.default_rng(5)
-    x, y = rng.normal(size=(2, 2_000)) * 8.0
+    x, y = rng.uniform(-20, 20, size=(2, 2_000))
     hits = ae.Hits(x=x, y=y, mass_to_charge=rng.choice([14.0, 63.0], 2_000))
     state, row = ServerState(), (ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(60.0), "undecided")
 
