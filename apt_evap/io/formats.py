@@ -257,7 +257,7 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     """
     chosen = _by_suffix(path, format, "write")
     if chosen.write is None:
-        reason = "contains a Run (run.save)" if chosen.suffix == ".h5" else "can only be read"
+        reason = "contains a Run (run.save)" if chosen.suffix == ".h5" else "is a format that can only be read"
         raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
     if not isinstance(hits, Hits):
         raise ValueError(f"hits must be Hits, such as run.hits(perturbation), got {short_text(hits)}")

@@ -226,6 +226,7 @@ def find_planes(
     points = check_array(positions, "positions", ("n", 3))
     radius = check_number(radius, "radius", above=0, unit="nm")
     widest = check_number(widest, "widest", at_least=0, at_most=60, unit="degrees")
+    reach = check_number(reach, "reach", above=0, unit="nm")
     centre = points[:, :2].mean(axis=0) if at is None else check_array(at, "at", (2,))
     chosen = points[np.hypot(*(points[:, :2] - centre).T) <= radius]
     if len(chosen) < _FEWEST_OF_PLANES:

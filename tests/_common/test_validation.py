@@ -522,6 +522,15 @@ CASES = [
         observed_angles=[[1.0], [NAN, 1.0], [-1.0, 1.0]],
     ),
     row(
+        ae.reconstruction.find_planes,
+        {"positions": np.random.default_rng(0).random((100, 3)), "widest": 0.0},
+        positions=[np.zeros((3, 2)), None],
+        at=[[1.0], "centre"],
+        radius=[0, -1.0, NAN, "1"],
+        widest=[-1, 61, NAN],
+        reach=[0, NAN, "1"],
+    ),
+    row(
         ae.reconstruction.distribution_map,
         {"positions": np.indices((3, 3, 3)).reshape(3, -1).T * 0.2},
         "lateral reach radius",
@@ -764,7 +773,7 @@ OTHER_PACKAGES = (ae.plot, ae.studies)
 # made by the package
 MADE = {"FileError", "TruncatedFile", "Outcome", "StopReason", "RunInterrupted", "RunNotSaved", "Run", "EmitterState"}
 MADE |= {"Reconstruction", "Study", "ZoneLine", "History", "CapHistory", "Ring", "RadiusFit", "TipFit", "Distortion"}
-MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens"}
+MADE |= {"DistortionGrid", "FittedOrientation", "Similarity", "Batch", "Lens", "Spectrum"}
 # for extensions, which call them with arrays of the package
 ARRAYS = {"charge_probabilities", "draw_isotopes", "field_of_counts", "ion_charges"}
 ARRAYS |= {"smoothed_history", "charge_history"}
@@ -790,6 +799,8 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
     taken |= {"PointCloud", "CompositionField", "TriangleMesh", "ConvexHull", "label_clusters"}  # in tests/measures
     taken |= {"compare_with_truth", "corrected", "truth_comparison"}  # in tests/reconstruction
+    taken |= {"assumptions", "local_scatter", "position_covariances"}
+    taken |= {"dissociation_line", "load_dataset"}  # in test_correlation, test_dataset
     taken |= {"choose_separation", "nearest_neighbours", "radial_distribution", "short_range_order"}
     taken |= {"interfacial_excess", "ladder_diagram", "read_mesh", "clusters", "composition_profile"}  # and tests/io
     taken |= {"simulate", "compare", "twin", "spectrum", "write_rrng"}  # in tests/studies, tests/cli, tests/detection

@@ -232,7 +232,7 @@ def test_species_from_ranges(tmp_path):
 
 def test_what_cannot_be_written(tmp_path):
     for suffix in (".apt", ".raw"):
-        with pytest.raises(FileError, match=rf"a {suffix} file can only be read"):
+        with pytest.raises(FileError, match=rf"a {suffix} file is a format that can only be read"):
             write(tmp_path / f"a{suffix}", full())
     with pytest.raises(ValueError, match="hits"):
         write(tmp_path / "a.xyz", 5)
