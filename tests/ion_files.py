@@ -248,3 +248,17 @@ def lammps_data(positions, types, style="atomic", comment=True, more="", labels=
     for k, (place, kind) in enumerate(zip(positions, types, strict=True), 1):
         text += before.format(k=k, t=kind) + " " + " ".join(repr(float(value)) for value in place) + more + "\n"
     return text + "\nVelocities\n\n1 0 0 0\n"
+
+
+def xrng(*ranges):
+    """Text of an .xrng file, of (low, high, charge, volume, atomic numbers)."""
+    items = []
+    for low, high, charge, volume, numbers in ranges:
+        atoms = "".join(f"<item><atomicnumber>{z}</atomicnumber></item>\n" for z in numbers)
+        items.append(
+            f"<item>\n<masstochargebegin>{low}</masstochargebegin>\n<masstochargeend>{high}</masstochargeend>\n<ions>\n"
+            f"<item>\n<chargestate>{charge}</chargestate>\n<volume>{volume}</volume>\n<atoms>\n{atoms}</atoms>\n</item>"
+            "\n</ions>\n</item>\n"
+        )
+    body = "".join(items)
+    return f'<?xml version="1.0" encoding="utf-8"?>\n<rangefile version="1">\n<ranges>\n{body}</ranges>\n</rangefile>\n'

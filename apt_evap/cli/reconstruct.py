@@ -98,7 +98,7 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap.cli._files import file_of, note
     from apt_evap.io.formats import read_ranges, write
     from apt_evap.plot.reconstructions import FEWEST
-    from apt_evap.reconstruction.assumptions import assumptions
+    from apt_evap.reconstruction.assumed_constants import assumptions
     from apt_evap.reconstruction.evolving import EvolvingReconstruction
     from apt_evap.reconstruction.origins import OriginTable
     from apt_evap.reconstruction.reconstruct import reconstruct
@@ -150,7 +150,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _check_complete(options, settings, hits):
     """Raise one error that names all constants that are missing, each with a value to start from."""
-    from apt_evap.reconstruction.assumptions import STARTS
+    from apt_evap.reconstruction.assumed_constants import STARTS
 
     if hits.voltage is None and settings["radius"] == "voltage":
         raise ValueError(

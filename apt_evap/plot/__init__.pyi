@@ -27,4 +27,4 @@ from .specimen_figures import specimen as specimen
 from .spectra import spectrum as spectrum
 from .study_figures import score_matrix as score_matrix
 from .study_figures import side_by_side as side_by_side
-from .surface_history import surface_history as surface_history
+from .surface_figures import surface_history as surface_history

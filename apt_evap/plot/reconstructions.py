@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
@@ -86,7 +87,7 @@ def reconstruction(
     return axes
 
 
-def species_of(result, ranges):
+def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str], Integers]:
     """Names of the groups of ions, the most frequent first, and the group of each ion."""
     if ranges is not None:
         labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)").labels(result.hits, OUTSIDE)

@@ -1,5 +1,5 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
-from .assumptions import assumptions as assumptions
+from .assumed_constants import assumptions as assumptions
 from .calibration import compression_from_poles as compression_from_poles
 from .calibration import distribution_map as distribution_map
 from .calibration import find_planes as find_planes

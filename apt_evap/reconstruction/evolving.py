@@ -180,6 +180,8 @@ class EvolvingReconstruction(Reconstruction):
 
     Parameters
     ----------
+    positions, hits, radii, settings, geometry, shifts, covariances
+        As for `Reconstruction`.
     history : SurfaceHistory or None
         Shape and field of the surface through time; None if the cap was used.
     phases : tuple of PhaseField
@@ -200,8 +202,10 @@ class EvolvingReconstruction(Reconstruction):
     verdict: str = ""
     apex_depths: Floats | None = None
     ion_fields: Floats | None = None
-    _followed: Any = field(default=None, repr=False)  # what `again` needs
+    _followed: Any = field(default=None, repr=False)
+    """What `again` needs: what was measured, and what was kept fixed."""
     _cap_radii: Floats | None = field(default=None, repr=False)
+    """Radii of the cap [nm], for `cap_positions`."""
 
     _has_free_projection: ClassVar[bool] = False
 

@@ -280,7 +280,7 @@ def test_what_is_refused():
     for ions, element, options, message in (
         (bare, "Ni", {}, "these hits have no charges: pass ranges=read_ranges"),
         (bare, "Fe", {"ranges": ranges}, "ranges have no range of single atoms of Fe, only of Ni"),
-        (bare, "U", {"ranges": ranges}, "element must be one of"),
+        (bare, "Xx", {"ranges": ranges}, "element must be one of"),
         (bare, "Ni", {"ranges": "ni.rrng"}, "ranges must be Ranges"),
         (bare, "Ni", {"ranges": ranges}, "two neighbouring charges, got charges 1"),
         (hits, 28, {}, "element must be a chemical symbol"),

@@ -34,7 +34,7 @@ def test_bash_completes(tmp_path, monkeypatch, capsys):
         Path(name).touch()
     Path("study").mkdir()
     assert {"run", "map", "compare", "examples"} < completed("")
-    assert completed("comp") == {"compare", "completion"}
+    assert completed("comp") == {"compare", "completion", "composition"}
     assert completed("compare", "--me") == {"--means", "--mechanism"}
     assert completed("compare", "--mechanism", "") == {"roll-up", "lateral", "combined"}
     assert completed("map", "ni") == {"ni111.h5"}

@@ -26,6 +26,7 @@ from ion_files import (
     tapsim_nodes,
     tapsim_table,
     usual_apt,
+    xrng,
 )
 
 import apt_evap as ae
@@ -53,6 +54,7 @@ def samples():
         ".rrng": RANGES,
         ".rng": RNG.encode(),
         ".env": ENV.encode(),
+        ".xrng": xrng((13.8, 14.2, 2, 0.02, [14]), (43.8, 44.2, 1, 0, [14, 8])).encode(),
         ".tapsim": tapsim_table(4)[0],
         ".h5": b"\x89HDF\r\n\x1a\n" + bytes(300),
     }

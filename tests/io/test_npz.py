@@ -26,7 +26,9 @@ def test_counts_with_a_mask(tmp_path):
     assert map.x_edges == pytest.approx(10 * X) and map.y_edges == pytest.approx(10 * Y)
     assert map.source.endswith("map.npz")
     assert np.array_equal(ae.read(tmp_path / "map.npz").counts, COUNTS)
-    suffixes = r"must be one of \.h5, \.nxs, \.epos, \.pos, \.apt, \.raw, \.npz, \.tapsim, got suffix '\.py'$"
+    suffixes = (
+        r"must be one of \.h5, \.nxs, \.epos, \.pos, \.apt, \.raw, \.npz, \.csv, \.txt, \.tapsim, got suffix '\.py'$"
+    )
     with pytest.raises(ae.FileError, match=suffixes):
         ae.read(Path(__file__))
 

@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from ion_files import ENV, RNG
+from ion_files import ENV, RNG, xrng
 
 from apt_evap._common.files import FileError
 from apt_evap.detection.hits import Hits
@@ -28,20 +28,6 @@ def rng(species, dashes, *rows):
     for name in species:
         lines += [f"long name of {name}", f"{name} 0.2 0.4 0.6"]
     return "\n".join([*lines, dashes, *rows]) + "\n"
-
-
-def xrng(*ranges):
-    """Text of an .xrng file, of (low, high, charge, volume, atomic numbers)."""
-    items = []
-    for low, high, charge, volume, numbers in ranges:
-        atoms = "".join(f"<item><atomicnumber>{z}</atomicnumber></item>\n" for z in numbers)
-        items.append(
-            f"<item>\n<masstochargebegin>{low}</masstochargebegin>\n<masstochargeend>{high}</masstochargeend>\n<ions>\n"
-            f"<item>\n<chargestate>{charge}</chargestate>\n<volume>{volume}</volume>\n<atoms>\n{atoms}</atoms>\n</item>"
-            "\n</ions>\n</item>\n"
-        )
-    body = "".join(items)
-    return f'<?xml version="1.0" encoding="utf-8"?>\n<rangefile version="1">\n<ranges>\n{body}</ranges>\n</rangefile>\n'
 
 
 @pytest.fixture

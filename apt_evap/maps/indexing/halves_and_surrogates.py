@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from scipy.spatial.transform import Rotation
 
 from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.symmetry import point_group
@@ -91,7 +90,12 @@ def _evidence(terms, gram, cross):
 
 def _of_winner(view, terms, fit, windows, pictures):
     """Largest evidence of orientations near the winner in every half, shape (HALVES,)."""
-    turns = [Rotation.from_rotvec((x, y, z), degrees=True).as_matrix() for x in _NEAR for y in _NEAR for z in _NEAR]
+    turns = [
+        scipy.spatial.transform.Rotation.from_rotvec((x, y, z), degrees=True).as_matrix()
+        for x in _NEAR
+        for y in _NEAR
+        for z in _NEAR
+    ]
     near = np.array(turns) @ fit.matrix
     best = np.full(HALVES, -np.inf)
     for factor in _SCALES:
@@ -121,7 +125,7 @@ def _of_others(view, terms, fit, windows, pictures):
     areas = places_of()[1].reshape(RINGS, AZIMUTHS)[:, 0]
     areas = (areas / areas.sum() * 2 / AZIMUTHS).astype(np.float32)
     angles = polar_grid(RINGS, AZIMUTHS)[1]
-    about = np.stack([Rotation.from_rotvec((0, 0, angle)).as_matrix() for angle in angles])
+    about = np.stack([scipy.spatial.transform.Rotation.from_rotvec((0, 0, angle)).as_matrix() for angle in angles])
     turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, STEP)])
     turns = np.concatenate([turns, np.diag([1.0, -1.0, 1.0]) @ -turns])  # both hands
     best = np.full(HALVES, -np.inf)

@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 from apt_evap._common.blas_threads import one_blas_thread
+from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -23,12 +24,12 @@ from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.halves_and_surrogates import second_lattice, surrogates_of
 from apt_evap.maps.indexing.joint_search import CONTRAST, COUNTED, JOINT, JointSearch
-from apt_evap.maps.indexing.marked_poles import check_places, contradictory_marks, contradictory_pair, marks_of
+from apt_evap.maps.indexing.marked_poles import Mark, check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns, mixture
 from apt_evap.maps.indexing.orientation_search import Start, UnusableMap, disc_of, flattened_by_rings
 from apt_evap.maps.indexing.refine import resolution
-from apt_evap.maps.indexing.two_criteria import Weighed, angle_between, dispersion_of, view_of, weighed
-from apt_evap.specimen.materials import as_material
+from apt_evap.maps.indexing.two_criteria import View, Weighed, angle_between, dispersion_of, view_of, weighed
+from apt_evap.specimen.materials import Material, as_material
 
 WIDEST, NARROWEST = 45.0, 12.0
 """Half angles of the field of view between which the scale is searched, if it is not known [degrees]."""
@@ -395,7 +396,15 @@ class _Crystal:
         Marks of a user.
     """
 
-    def __init__(self, view, material, patterns, scales, bounds, marks=()):
+    def __init__(
+        self,
+        view: View,
+        material: Material,
+        patterns: Sequence[MasterPattern],
+        scales: tuple[float, float],
+        bounds: tuple[float, float],
+        marks: Sequence[Mark] = (),
+    ) -> None:
         self.view, self.material, self.patterns, self.scales, self.bounds = view, material, patterns, scales, bounds
         self.marks = marks
         packaged = patterns is master_patterns(material.structure)
@@ -407,7 +416,7 @@ class _Crystal:
         return JointSearch(self.view.disc, self.view.picture, self.terms, self.patterns, self.scales, self.marks)
 
     @cached_property
-    def densities(self):
+    def densities(self) -> Floats:
         """Densities of the patterns, smoothed for the bins, shape (k, m, m)."""
         sigma = resolution(self.view.disc, math.sqrt(self.scales[0] * self.scales[1]))
         return np.concatenate([pattern.smoothed(sigma) for pattern in self.patterns])

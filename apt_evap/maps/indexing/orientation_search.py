@@ -161,7 +161,7 @@ def polar_grid(rings: int, azimuths: int) -> tuple[np.ndarray, np.ndarray]:
     return (np.arange(rings) + 0.5) / rings, np.arange(azimuths) * (2 * np.pi / azimuths)
 
 
-def slow_changes(radii, azimuths):
+def slow_changes(radii: Floats, azimuths: Floats) -> tuple[Floats, Floats]:
     """Orthonormal polynomials on the disc, with the areas of the points as weights, (n, k), and these weights (n,)."""
     r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
     x, y = r * np.cos(phi), r * np.sin(phi)
