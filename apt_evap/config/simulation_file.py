@@ -134,9 +134,7 @@ class Config:
             raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
         self.maps.check_detector(self.detector)
         if self.real_units is not None and not self.responses:
-            for (
-                perturbation
-            ) in self.emissions:  # its energies are those of an experiment, its flight would be at 1000 V
+            for perturbation in self.emissions:  # energies are those of an experiment, the flight would be at 1000 V
                 if perturbation != Unperturbed():
                     raise ValueError(
                         f"[simulation] responses must be true for maps of {short_text(perturbation)} in real units"

@@ -66,7 +66,8 @@ def assumptions(reconstruction: Reconstruction, names: Sequence[str]) -> list[As
     Returns
     -------
     list of Assumption
-        One for each name whose constant the reconstruction has. NaN where ions would leave the cap.
+        One for each name whose constant the reconstruction has; none for ions without a width or a depth, such as a
+        single one. NaN where ions would leave the cap.
 
     Notes
     -----
@@ -94,6 +95,8 @@ def assumptions(reconstruction: Reconstruction, names: Sequence[str]) -> list[As
         return float(np.sqrt(found.positions[:, :2].var(axis=0).sum())), float(found.depths[-1])
 
     usual = extents()
+    if not all(usual):  # one ion, or all at one place
+        return []
     found = []
     for name in names:
         check_choice(name, "names", tuple(STARTS))

@@ -66,6 +66,8 @@ def folder(tmp_path, monkeypatch, rough_layout):
         pulse_id=np.cumsum(rng.random(n) > 1 / 6),
     )
     ae.write("R5083.epos", measured)
+    composition = [{"Mg": 1}, {"Zn": 1}]
+    ae.io.write_rrng("R5083.rrng", ae.spectra.Ranges(("Mg", "Zn"), [28.5, 57.5], [29.5, 58.5], composition=composition))
     return tmp_path
 
 

@@ -161,7 +161,7 @@ def test_a_run_that_ended_early_shows_its_own_number_of_ions(tmp_path):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # in true eV the limit is lower
 def test_real_units_are_compared(tmp_path):
-    base = SMALL + "[real_units]\nflight_charges = 1\n"
+    base = SMALL + '[real_units]\nflight_charges = 1\nfield_reference = "site"\n'  # too few atoms for a cap
     study = 'base = "base.toml"\n[sweep]\n"real_units.flight_charges" = [1, 2]\n'
     sweep = planned(tmp_path, study, base)
     for key in sweep.keys:
