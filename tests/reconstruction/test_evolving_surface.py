@@ -203,6 +203,8 @@ def test_the_bits_do_not_depend_on_the_threads():
     digests = set()
     for threads in ("1", "2", "3"):
         variables = os.environ | {name: threads for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
-        run = subprocess.run([sys.executable, "-P", "-c", code], env=variables, capture_output=True, text=True, check=True)
+        run = subprocess.run(
+            [sys.executable, "-P", "-c", code], env=variables, capture_output=True, text=True, check=True
+        )
         digests.add(run.stdout)
     assert len(digests) == 1
