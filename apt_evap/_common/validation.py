@@ -15,7 +15,16 @@ LARGEST_SEED = 2**64 - 1
 _LARGEST_COUNT = 2**63 - 1  # integer type of the compiled core
 _LARGEST = 1e100  # the cube of a number is still finite
 _LONGEST_NAME = 100  # characters
-_SHORT = reprlib.Repr()
+
+
+class _Repr(reprlib.Repr):
+    """Short texts of values, in which the numbers of NumPy look like those of Python, also within others."""
+
+    def repr1(self, x: Any, level: int) -> str:
+        return super().repr1(x.item() if isinstance(x, np.generic) else x, level)
+
+
+_SHORT = _Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 100
 
 
@@ -299,7 +308,7 @@ def did_you_mean(word: object, known: Iterable[str]) -> str:
 def short_text(value: object) -> str:
     """Value as one short line, for messages."""
     try:
-        text = _SHORT.repr(value.item() if isinstance(value, np.generic) else value)
+        text = _SHORT.repr(value)
     except ValueError:  # Python does not print an integer of thousands of digits
         return "an integer of thousands of digits"
     return " ".join(text.split())

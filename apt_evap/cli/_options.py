@@ -27,6 +27,12 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     group.add_argument(
         "--undistort", metavar="GRID.csv", help="calibration grid of the instrument, such as a reflectron"
     )
+    group.add_argument(
+        "--exchange-axes",
+        action="store_true",
+        default=None,
+        help="exchange detectorX and detectorY of the grid, for programs whose x is the y of the hits",
+    )
     selection = parser.add_argument_group("selection of ions", "LOW <= value < HIGH; LOW or HIGH may be omitted: 27,")
     selection.add_argument("--mass", type=bounds_type, metavar="LOW,HIGH", help="mass-to-charge ratio [Da]")
     selection.add_argument("--voltage", type=bounds_type, metavar="LOW,HIGH", help="DC voltage [V]")

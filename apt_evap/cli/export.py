@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from apt_evap.cli._options import add_reading, add_real_units, add_speech, number_type
+from apt_evap.cli._options import add_reading, add_real_units, add_speech, integer_type, number_type
 from apt_evap.cli._output import tell, tell_json
 
 
@@ -11,8 +11,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
         "Write the ions that hit the detector, of a run or of a measurement, as a file of ions. The\n"
-        "suffix of FILE selects the format. In real units an .epos has the voltages, times of flight, mass-to-charge\n"
-        "ratios and pulses that an instrument could have written."
+        "suffix of FILE selects the format, .h5 that of PyCCAPT. In real units an .epos has the voltages,\n"
+        "times of flight, mass-to-charge ratios and pulses that an instrument could have written."
     )
     parser.epilog = (
         "example: apt-evap export ni111.h5 --real-units --perturbation RollUp:0.36,0.36 -o ni111.epos\n"
@@ -20,6 +20,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("file", metavar="IONS", help="a run (.h5) or measured ions (.epos, ...)")
     parser.add_argument("-o", "--output", metavar="FILE", help="default: the name of IONS with .epos")
+    parser.add_argument(
+        "--decimals", type=integer_type(0, 17), metavar="N", help="of numbers in a .csv; default: exact"
+    )
+    parser.add_argument("--separator", choices=("comma", "semicolon", "tab"), help="of columns in a .csv")
     parser.add_argument("--elements", metavar="NAME,...", help="of the specimen, for .nxs; default: those of the run")
     parser.add_argument("--perturbation", metavar="P", help="as for map; default: the first one of the run")
     add_real_units(parser)
@@ -40,6 +44,8 @@ def execute(options: argparse.Namespace) -> int:
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     content = read(options)
+    if output.exists() and output.samefile(check_path(options.file)):
+        raise FileError(f"{str(output)!r} is the file that is read: -o needs another name")
     hits = file_of(options).select(_ions(content, options))
     detected = hits[hits.detected]
     if not len(detected):
@@ -80,13 +86,17 @@ def _ions(content, options):
 
 
 def _writing(output, content, options):
-    """Options of the writer: an .nxs has the elements of the specimen."""
+    """Options of the writer: an .nxs has the elements of the specimen, a .csv a form of its numbers."""
     from apt_evap.simulation.run import Run
 
+    form = {name: getattr(options, name) for name in ("decimals", "separator") if getattr(options, name) is not None}
+    for name in form:
+        if output.suffix.lower() != ".csv":
+            raise ValueError(f"--{name} is for a .csv file, got {str(output)!r}")
     if output.suffix.lower() != ".nxs":
         if options.elements is not None:
             raise ValueError(f"--elements is for an .nxs file, got {str(output)!r}")
-        return {}
+        return form
     if options.elements is not None:
         return {"elements": options.elements.split(",")}
     if not isinstance(content, Run):

@@ -150,13 +150,48 @@ def are_grouped(blocks: Iterable[NDArray[np.integer]], path: AnyPath) -> bool:
     return has_numbers
 
 
-def first_from_every(multiplicity: NDArray[np.integer]) -> NDArray[np.uint32] | None:
-    """Convert n for every ion of a pulse to n for the first and 0 for the others; None if this is not possible."""
+class EveryCheck:
+    """Check, block by block, that a column has n for every ion of a pulse of n ions."""
+
+    def __init__(self) -> None:
+        self.largest = 0
+        self._good = True
+        self._rest = np.empty(0, np.uint32)  # rows of the last pulse, if it is not complete
+
+    def add(self, ions: NDArray[np.integer]) -> None:
+        """Check the next rows of the column."""
+        for start in range(0, len(ions), _BLOCK):
+            self._good = self._good and self._add_block(ions[start : start + _BLOCK])
+
+    def _add_block(self, ions):
+        low, high = int(ions.min()), int(ions.max())
+        self.largest = max(self.largest, high)
+        if low == high == 1:
+            return not len(self._rest)
+        rows = np.concatenate([self._rest, ions])
+        if low < 1 or first_from_every(rows, cut=True) is None:
+            return False
+        others = np.flatnonzero(rows != rows[-1])
+        last = rows[others[-1] + 1 :] if len(others) else rows
+        self._rest = last[len(last) - len(last) % int(rows[-1]) :].copy()
+        return True
+
+    def holds(self, cut: bool) -> bool:
+        """Whether it is so in the whole column; `cut` if the end of the file is missing."""
+        return self._good and (cut or not len(self._rest))
+
+
+def first_from_every(multiplicity: NDArray[np.integer], *, cut: bool = False) -> NDArray[np.uint32] | None:
+    """Convert n for every ion of a pulse to n for the first and 0 for the others; None if this is not possible.
+
+    With `cut`, the last pulse may have fewer rows.
+    """
     multiplicity = multiplicity.astype(np.int64)
     runs = first_from_equal(multiplicity)
     first = np.flatnonzero(runs)
     sizes = multiplicity[first]
-    if not (sizes > 0).all() or (runs[first] % sizes).any():
+    incomplete = runs[first] % sizes if (sizes > 0).all() else np.ones(1)
+    if (incomplete[:-1] if cut and len(sizes) else incomplete).any() or not (sizes > 0).all():
         return None
     within = np.arange(len(runs)) - np.repeat(first, runs[first])
     return np.where(within % multiplicity == 0, multiplicity, 0).astype(np.uint32)

@@ -105,7 +105,8 @@ def read_table(path: AnyPath, what: str, at_most: int) -> Table:
 
 
 def _divider(line):
-    """What divides the cells of a line: a semicolon, a tab, a comma, or None for spaces."""
+    """What divides the cells of a line: a semicolon, a tab, a comma, or None for spaces; none of those in quotes."""
+    line = re.sub(r'"[^"]*"', '""', line)
     for divider in ";\t":
         if divider in line:
             return divider

@@ -8,6 +8,7 @@ import numpy as np
 
 from apt_evap._common.files import FileError, replace_file
 from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import check_choice, check_count
 from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_any, check_columns
 from apt_evap.io._tables import read_table
@@ -23,7 +24,9 @@ _UNITS = {
     "positions": "nm",
 }
 
-
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t"}
+"""Dividers of columns by their names."""
+_MOST_DECIMALS = 17
 _LARGEST = 1 << 30  # bytes of a file, which is read as a whole
 _INTEGERS = ("pulses", "multiplicity", "pulse_id", "site", "ion", "outcome")
 # names of other programs without units, in lower case, and units with their factors to those of `Hits`
@@ -175,8 +178,8 @@ def _group(read, units):
             read[name] = np.column_stack([read.pop(part) for part in parts])
 
 
-def write_csv(path: AnyPath, hits: Hits) -> None:
-    """Write ions as CSV: commas between the columns, points in the numbers, UTF-8.
+def write_csv(path: AnyPath, hits: Hits, *, decimals: int | None = None, separator: str = "comma") -> None:
+    """Write ions as CSV: points in the numbers, UTF-8.
 
     The first line has the names of the columns with their units, such as "x [mm]". Positions are three columns. All
     ions are written, also those that missed the detector; a value that is not a number is "nan". Numbers have at most
@@ -188,12 +191,21 @@ def write_csv(path: AnyPath, hits: Hits) -> None:
         The file; an existing one is replaced when the new one is complete.
     hits : Hits
         The ions.
+    decimals : int, optional
+        Digits after the point, 0 to 17; by default as many as restore the exact values.
+    separator : {"comma", "semicolon", "tab"}
+        What divides the columns.
 
     Raises
     ------
     FileError
         If the file cannot be written.
+    ValueError
+        If an option has another value.
     """
+    divider = SEPARATORS[check_choice(separator, "separator (--separator)", SEPARATORS)]
+    if decimals is not None and check_count(decimals, "decimals (--decimals)", at_least=0) > _MOST_DECIMALS:
+        raise ValueError(f"decimals (--decimals) must be from 0 to {_MOST_DECIMALS}, got {decimals}")
     titles, formats, columns = [], [], []
     units = {**_UNITS, **hits.units}
     for name, values in (*((name, getattr(hits, name)) for name in hits.columns), *hits.extra.items()):
@@ -204,12 +216,15 @@ def write_csv(path: AnyPath, hits: Hits) -> None:
         unit = f" [{units[name]}]" if units.get(name) else ""
         label = "position" if name == "positions" else name
         titles += [_quoted(f"{label}{suffix}{unit}") for suffix in suffixes]
-        is_float = values.dtype.kind == "f"
-        formats += [("%.17g" if values.dtype.itemsize > 4 else "%.9g") if is_float else "%s"] * len(parts)
+        number = "%s"
+        if values.dtype.kind == "f":
+            exact = "%.17g" if values.dtype.itemsize > 4 else "%.9g"
+            number = exact if decimals is None else f"%.{decimals}f"
+        formats += [number] * len(parts)
         columns += parts
-    row = ",".join(formats) + "\r\n"  # RFC 4180
+    row = divider.join(formats) + "\r\n"  # RFC 4180
     with replace_file(path) as file:
-        file.write((",".join(titles) + "\r\n").encode())
+        file.write((divider.join(titles) + "\r\n").encode())
         for start in range(0, len(hits), _CHUNK):
             block = [_cells(column[start : start + _CHUNK]) for column in columns]
             file.write("".join([row % values for values in zip(*block, strict=True)]).encode())
@@ -223,5 +238,5 @@ def _cells(values):
 
 
 def _quoted(text):
-    """Text as one cell."""
-    return '"' + text.replace('"', '""') + '"' if any(character in text for character in ',"\r\n') else text
+    """Text as one cell, with quotes if it has anything that could divide cells or lines."""
+    return '"' + text.replace('"', '""') + '"' if any(character in text for character in ',;\t"\r\n') else text

@@ -59,7 +59,7 @@ def read_grid(path: AnyPath, *, exchange: bool = False) -> DistortionGrid:
     if grid.mirrored:
         warn(
             f"{str(path)!r} fits the detector only mirrored: are detectorX and detectorY exchanged "
-            "(read_grid(..., exchange=True))?",
+            "(read_grid(..., exchange=True), or --exchange-axes)?",
             DataWarning,
         )
     return grid

@@ -12,7 +12,14 @@ import numpy as np
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
 from apt_evap.detection.hits import Hits
-from apt_evap.io._pulses import PulseCheck, first_from_equal, pulses_from_first, whole_pulses
+from apt_evap.io._pulses import (
+    EveryCheck,
+    PulseCheck,
+    first_from_equal,
+    first_from_every,
+    pulses_from_first,
+    whole_pulses,
+)
 from apt_evap.io._records import MM, check_any, choose, choose_fields, in_mm, open_words, write_words
 from apt_evap.warnings import DataWarning, warn
 
@@ -70,8 +77,8 @@ def read_epos(
     Returns
     -------
     Hits
-        `pulse_id` and `multiplicity` are computed from the last column alone. If it is inconsistent, they are None,
-        with a warning.
+        `pulse_id` and `multiplicity` are computed from the last column alone: the number of ions of a pulse for its
+        first ion and 0 for the others, or for all of them. If it is inconsistent, they are None, with a warning.
 
     Raises
     ------
@@ -86,6 +93,8 @@ def read_epos(
         block = words.read(fields)
         survey.add(block)
         survey.end(words.cut, path)
+        if survey.grouped:
+            block["ions"] = survey.first_ions(block["ions"])
         return _hits(block, survey, chosen, path)
 
 
@@ -130,16 +139,19 @@ def chunk_epos(
         def keep(block):
             if not survey.grouped:
                 return rows
-            n = whole_pulses(block["ions"])
+            ions = survey.first_ions(block["ions"])
+            n = whole_pulses(ions)
             if n == 0:
-                raise too_few(block["ions"][0])
+                raise too_few(ions[0])
             return n
 
         # the last pulse of a truncated file may have fewer rows than ions
-        if survey.grouped and rows < survey.pulses.largest and not words.cut:
-            raise too_few(survey.pulses.largest)
+        if survey.grouped and rows < survey.largest and not words.cut:
+            raise too_few(survey.largest)
         first_pulse = 0
         for block in words.blocks(fields, rows, keep):
+            if survey.grouped:
+                block["ions"] = survey.first_ions(block["ions"])
             pulses = np.count_nonzero(block["ions"])
             yield _hits(block, survey, chosen, path, first_pulse)
             first_pulse += pulses
@@ -156,8 +168,10 @@ class _Survey:
         self._unit = voltage_unit
         self.present = set()
         self.highest = {}
-        self.pulses = PulseCheck()
-        self.grouped = False
+        self._pulses = PulseCheck()
+        self._every = EveryCheck()
+        self.grouped = self._of_every_ion = False
+        self.largest = 0
 
     @np.errstate(invalid="ignore")
     def add(self, block: Any) -> None:
@@ -170,7 +184,8 @@ class _Survey:
                 # fmax ignores NaN
                 self.highest[name] = np.fmax(self.highest.get(name, np.nan), np.fmax.reduce(values))
         if "ions" in block:
-            self.pulses.add(block["ions"])
+            self._pulses.add(block["ions"])
+            self._every.add(block["ions"])
 
     def end(self, cut: bool, path: AnyPath) -> Any:
         """Evaluate the complete file, and warn if the pulses are inconsistent."""
@@ -187,15 +202,21 @@ class _Survey:
         if "voltage" in self.present:
             self.present.add("pulse_voltage")
         self.present.add("pulses")
-        if self.pulses.rows:
-            problem = self.pulses.problem(cut)
-            self.grouped = not problem
-            if problem:
+        if self._pulses.rows:
+            problem = self._pulses.problem(cut)
+            self._of_every_ion = bool(problem) and self._every.holds(cut)
+            self.grouped = not problem or self._of_every_ion
+            self.largest = (self._every if self._of_every_ion else self._pulses).largest
+            if not self.grouped:
                 warn(
                     f"{str(path)!r}: pulses unknown, so pulse_id and multiplicity are None: the column of ions per "
                     f"pulse is inconsistent, {problem}",
                     DataWarning,
                 )
+
+    def first_ions(self, ions: Any) -> Any:
+        """Ions per pulse for the first ion of each pulse and 0 for the others; some files have it for all of them."""
+        return first_from_every(ions, cut=True) if self._of_every_ion else ions
 
 
 def _hits(block, survey, chosen, path, first_pulse=0):

@@ -85,11 +85,19 @@ def _write_nxapm(path, hits, *, elements=(), start_time=None):
     write_nxapm(path, hits, elements=elements, start_time=start_time)
 
 
+def _write_pyccapt(path, hits):
+    from apt_evap.io.pyccapt import write_pyccapt
+
+    write_pyccapt(path, hits)
+
+
 _GROUPING = ("pulse_id", "multiplicity")
+_OF_PYCCAPT = (*EPOS, *_GROUPING, "start_counter", "laser_pulse", "calibrated_time_of_flight")
+_OF_PYCCAPT += ("uncalibrated_mass_to_charge", "multi")
 _WIDEST = 500.0  # [mm]: of a detector; those of atom probes have 80 to 120
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
-    Format(".h5", _HDF5, _read_hdf5),
+    Format(".h5", _HDF5, _read_hdf5, _write_pyccapt, None, EPOS, lambda name, _: name in _OF_PYCCAPT),
     Format(".nxs", _HDF5, _read_hdf5, _write_nxapm, keeps=lambda name, values: values.dtype.kind in "biuf"),
     Format(".epos", None, read_epos, write_epos, chunk_epos, EPOS, lambda name, _: name in (*EPOS, *_GROUPING)),
     Format(".pos", None, read_pos, write_pos, chunk_pos, POS, lambda name, _: name in POS),
@@ -227,10 +235,10 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     Parameters
     ----------
     path : str or path-like
-        The file, .pos, .epos, .nxs, .tapsim, .csv, .xyz or .vtp; an existing one is replaced when the new one is
-        complete.
+        The file, .pos, .epos, .nxs, .tapsim, .csv, .xyz, .vtp or .h5 (of PyCCAPT); an existing one is replaced when the
+        new one is complete.
     hits : Hits
-        The ions. A .pos or .epos does not contain ions that did not hit the detector or have values that are not
+        The ions. A .pos, .epos or .h5 does not contain ions that did not hit the detector or have values that are not
         finite; an .xyz or .vtp does not contain ions whose positions are not finite. A warning gives the number of
         ions left out. The other formats contain all ions. For measured ions, a warning names the columns for which the
         format has no place.
@@ -238,7 +246,8 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
         Suffix of the format, such as ".pos", for any name of the file.
     **options
         Options of the writer of the format: ``species`` gives the species of the ions in an .xyz, ``elements`` (needed)
-        and ``start_time`` are for an .nxs, ``binary=True`` for a .tapsim.
+        and ``start_time`` are for an .nxs, ``binary=True`` for a .tapsim, ``decimals`` and ``separator`` ("comma",
+        "semicolon" or "tab") for a .csv.
 
     Raises
     ------
@@ -257,8 +266,9 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     """
     chosen = _by_suffix(path, format, "write")
     if chosen.write is None:
-        reason = "contains a Run (run.save)" if chosen.suffix == ".h5" else "is a format that can only be read"
-        raise FileError(f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file {reason}")
+        raise FileError(
+            f"hits cannot be written to {str(path)!r}: a {chosen.suffix} file is a format that can only be read"
+        )
     if not isinstance(hits, Hits):
         raise ValueError(f"hits must be Hits, such as run.hits(perturbation), got {short_text(hits)}")
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)

@@ -8,6 +8,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
 from apt_evap.io.nxapm import KIND, read_nxapm
 from apt_evap.io.nxapm_others import is_nxapm, read_nxapm_of_others
+from apt_evap.io.pyccapt import KIND as PYCCAPT
 from apt_evap.io.pyccapt import is_pyccapt, read_pyccapt
 
 
@@ -35,7 +36,7 @@ def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
         kind = file.label.kind if file.label else ""
         if kind == KIND:
             reader = read_nxapm
-        elif not kind and is_pyccapt(file):
+        elif kind in ("", PYCCAPT) and is_pyccapt(file):
             reader = read_pyccapt
         elif not kind and is_nxapm(file):
             reader = read_nxapm_of_others

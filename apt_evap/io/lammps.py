@@ -111,7 +111,12 @@ def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
         raise FileError(f"{where} has no columns x y z (or xs, xu, xsu, ...), only {' '.join(columns):.100}")
     images = [f"i{axis}" for axis in "xyz" if f"i{axis}" in columns and "u" not in suffix]
     texts, values = atom_table(
-        rows, [columns.index(name) for name in kinds], [columns.index(name) for name in names + images], where
+        rows,
+        [columns.index(name) for name in kinds],
+        [columns.index(name) for name in names + images],
+        where,
+        lines,
+        first + 1,
     )
     flags = np.zeros((n, 3))
     flags[:, ["xyz".index(name[1]) for name in images]] = _whole(values[:, 3:], where)
@@ -235,7 +240,7 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     of_type, first = _STYLES[style]
     if width not in (first + 3, first + 6):
         raise FileError(f"{where}: the style {style} has {first + 3} columns or {first + 6}, got {width}")
-    (types,), values = atom_table(rows, [of_type], range(first, width), where)
+    (types,), values = atom_table(rows, [of_type], range(first, width), where, lines, at + 1)
     positions = values[:, :3]
     if width == first + 6 and (flags := _whole(values[:, 3:], where)).any():
         positions = positions + flags @ _box_of_data(lines[: min(at for at, _ in sections.values())], where)
@@ -267,17 +272,37 @@ def _names_of_masses(lines, at):
 
 
 def atom_table(
-    rows: Sequence[str], of_texts: Sequence[int], of_numbers: Sequence[int], where: str
+    rows: Sequence[str], of_texts: Sequence[int], of_numbers: Sequence[int], where: str, lines: Sequence[str], at: int
 ) -> tuple[list[list[str]], Floats]:
-    """Columns of the rows of the atoms with these numbers: lists of texts, and finite numbers, shape (n, k)."""
+    """Columns of the rows of the atoms with these numbers: lists of texts, and finite numbers, shape (n, k).
+
+    The rows are in `lines` of the file from `at`: an error names the line.
+    """
     try:
+        if not all(row.strip() for row in rows):  # NumPy leaves out empty rows, with a warning
+            raise ValueError("an empty row")
         texts = np.loadtxt(rows, str, comments=None, usecols=tuple(of_texts), ndmin=2).T.tolist()
         numbers = np.loadtxt(rows, float, comments=None, usecols=tuple(of_numbers), ndmin=2)
-    except ValueError as error:
-        raise FileError(f"{where}: expected numbers for the coordinates of each atom, got {error!s:.100}") from error
-    if len(numbers) != len(rows):
-        raise FileError(f"{where} states {len(rows)} atoms but contains {len(numbers)}")
-    return texts, _finite(numbers, where)
+        good = bool(np.isfinite(numbers).all())
+    except ValueError:
+        good = False
+    if not good:
+        least = max(*of_texts, *of_numbers) + 1
+        row = next(row for row in rows if not _is_atom(row.split(), least, of_numbers))
+        line = next(k for k in range(at, len(lines)) if row in (lines[k], lines[k].partition("#")[0].strip()))
+        raise FileError(
+            f"{where}, line {line + 1}: expected {least} columns or more with finite coordinates of an atom, got "
+            f"{short_text(row)}"
+        )
+    return texts, numbers
+
+
+def _is_atom(cells, least, of_numbers):
+    """Whether a row has these columns, and finite numbers in some of them."""
+    try:
+        return len(cells) >= least and all(np.isfinite(float(cells[k])) for k in of_numbers)
+    except ValueError:
+        return False
 
 
 def _section_rows(lines, at, n):

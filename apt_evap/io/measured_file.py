@@ -72,6 +72,7 @@ class MeasuredFile:
     unit: str | None = _optional("Unit on the detector.", "str", _text)
     voltage_unit: str | None = choice("Of an .epos.", ("V", "kV"), default=None)
     undistort: str | None = _optional("File of a calibration grid.", "str or path-like", _path)
+    exchange_axes: bool | None = switch("Exchange detectorX and detectorY of the grid.", default=None)
     distance: float | None = number(
         "Flight length, from which masses follow if there are none.", default=None, above=0, unit="mm"
     )
@@ -120,6 +121,8 @@ class MeasuredFile:
             if getattr(self, name) is not None:
                 what = "ions" if self.is_map else "a map in an .npz file"
                 raise ValueError(f"--{_option(name)} is for {what}, got {self.path!r}")
+        if self.exchange_axes and self.undistort is None:
+            raise ValueError("--exchange-axes needs --undistort, a calibration grid")
         content = read(self.path, **self._reading())
         if self.undistort is None:
             return content
@@ -246,7 +249,8 @@ class MeasuredFile:
         return {name: value for name, value in options.items() if value is not None}
 
     def _undistorted(self, ae, hits):
-        return hits.undistorted(ae.io.read_grid(self.undistort))
+        options = {"exchange": True} if self.exchange_axes else {}
+        return hits.undistorted(ae.io.read_grid(self.undistort, **options))
 
     def _steps(self, columns) -> Iterator[tuple[str, Callable[[Any, Any], Any]]]:
         """Selections but that by peaks, with the names of their options.

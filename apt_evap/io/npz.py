@@ -105,6 +105,10 @@ def _check_sizes(file):
     """Check from the headers of all arrays that they are stored completely, before memory is taken for them."""
     headers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     with zipfile.ZipFile(file) as archive:
+        names = archive.namelist()
+        if names and not any(name.endswith(".npy") for name in names):
+            shown = ", ".join(map(repr, names[:3])) + (", ..." if len(names) > 3 else "")
+            raise ValueError(f"it is a .zip archive with {shown}: unpack it")
         for info in archive.infolist():
             with archive.open(info) as member:
                 version = np.lib.format.read_magic(member)

@@ -1,19 +1,22 @@
 """HDF5 files of PyCCAPT, the software of the OXCART atom probe: the instrument's own, and those of its calibration.
 
 The instrument writes one dataset for each column into the group ``dld``: detector coordinates in cm, times in ns. The
-calibration writes a DataFrame of pandas with the name ``df``, whose columns have names such as "x_det (cm)".
+calibration writes a DataFrame of pandas with the name ``df``, whose columns have names such as "x_det (cm)". This is
+what `write_pyccapt` writes, too, without pandas: its blocks and attributes are those of ``to_hdf(path, key="df")``.
 """
 
 from collections.abc import Sequence
 
+import h5py
 import numpy as np
 
-from apt_evap._common.checked_hdf5 import CheckedFile, open_hdf5
-from apt_evap._common.files import FileError
+from apt_evap._common.checked_hdf5 import CheckedFile, label_of, open_hdf5, put_field, write_hdf5
+from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
+from apt_evap._common.validation import short_text
 from apt_evap.detection.hits import Hits
-from apt_evap.io._pulses import first_from_equal, ions_per_pulse, pulses_from_first
-from apt_evap.io._records import check_any, check_columns
+from apt_evap.io._pulses import are_grouped, first_from_equal, ions_per_pulse, pulses_from_first
+from apt_evap.io._records import check_any, check_columns, choose
 from apt_evap.io.nxapm import numbers
 
 _MM_PER_CM = 10.0
@@ -53,6 +56,23 @@ _EXTRA = {
     "start_counter": "",
     "multi": "",
 }
+_TABLE = (  # columns of a calibration in their order, with those of `Hits`, and factors to their units
+    ("x (nm)", "position_x", 1.0),
+    ("y (nm)", "position_y", 1.0),
+    ("z (nm)", "position_z", 1.0),
+    ("mc (Da)", "mass_to_charge", 1.0),
+    ("mc_uc (Da)", "uncalibrated_mass_to_charge", 1.0),
+    ("high_voltage (V)", "voltage", 1.0),
+    ("pulse_v (V)", "pulse_voltage", 1.0),
+    ("pulse_l (pJ)", "laser_pulse", 1.0),
+    ("t (ns)", "time_of_flight", 1.0),
+    ("t_c (ns)", "calibrated_time_of_flight", 1.0),
+    ("x_det (cm)", "x", 1 / _MM_PER_CM),
+    ("y_det (cm)", "y", 1 / _MM_PER_CM),
+)
+_COUNTED = (("delta_p", "pulses"), ("multi", "multi"), ("start_counter", "start_counter"))  # integers
+KIND = "PyCCAPT"
+WRITTEN = ("positions", "mass_to_charge", "voltage", "pulse_voltage", "time_of_flight", "x", "y", "pulses")
 _CONTINUOUS = ("x", "y", "time_of_flight")  # integers are raw counts of the detector
 _KEPT = ("x", "y", "pulse_voltage")  # columns that may be zero for all ions
 
@@ -170,7 +190,7 @@ def _hits(table, path, columns):
     if all(name in table for name in _POSITIONS):
         table["positions"] = np.column_stack([table.pop(name) for name in _POSITIONS])
     table = {name: values for name, values in table.items() if name not in _POSITIONS}
-    if "start_counter" in table and len(table["x"]):
+    if "start_counter" in table and len(table["x"]) and are_grouped([table["start_counter"]], path):
         table["pulse_id"], table["multiplicity"] = pulses_from_first(first_from_equal(table["start_counter"]))
     elif "multi" in table and (ions := ions_per_pulse(table["multi"])[0]) is not None:
         table["pulse_id"], table["multiplicity"] = pulses_from_first(ions)
@@ -181,6 +201,92 @@ def _hits(table, path, columns):
     extra = {name: requested.pop(name) for name in _EXTRA if name in requested}
     units = {name: _EXTRA[name] for name in extra if _EXTRA[name]}
     return Hits(**requested, extra=extra, units=units, source=path)
+
+
+def write_pyccapt(path: AnyPath, hits: Hits) -> None:
+    """Write ions as a calibrated file of PyCCAPT, which it reads as "processed".
+
+    All floats are float64, as in PyCCAPT, and all counts int64. Missing columns are zeros. The start counter is that in
+    ``extra``, or else the number of the pulse; "multi" is the number of ions of a pulse for each of its ions.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file; an existing one is replaced when the new one is complete, but never a run.
+    hits : Hits
+        The ions.
+
+    Raises
+    ------
+    ValueError
+        If there are no detector coordinates, or there is no ion to write.
+    FileError
+        If the file is a run, or cannot be written.
+    """
+    place = check_path(path)
+    if place.is_file() and (label := _label(place)) is not None and label.kind.split()[0] == "run":
+        raise FileError(f"{str(path)!r} is a run, which ions do not replace: expected another name")
+    if hits.x is None or hits.y is None:
+        raise ValueError(f"hits must have detector coordinates x and y for {str(path)!r}, got {short_text(hits)}")
+    columns = {name: getattr(hits, name) for name in WRITTEN} | dict(hits.extra)
+    floats = [columns[name] for name in WRITTEN if name != "pulses"]
+    chosen = choose(path, hits, [(0, values, "f4") for values in floats])
+    if hits.positions is not None:
+        columns |= dict(zip(_POSITIONS, hits.positions.T, strict=True))
+    if hits.pulse_id is not None:
+        columns.setdefault("start_counter", hits.pulse_id + 1)  # a column of zeros is absent
+        ions = first_from_equal(hits.pulse_id[chosen])
+        columns["multi"] = np.zeros(len(hits), np.int64)
+        columns["multi"][chosen] = np.repeat(ions[ions > 0], ions[ions > 0])
+    n = len(hits.x[chosen])
+    numbers = np.zeros((n, len(_TABLE)))
+    for k, (_, name, factor) in enumerate(_TABLE):
+        if (values := columns.get(name)) is not None:
+            numbers[:, k] = values[chosen].astype(float) * factor
+    counts = np.zeros((n, len(_COUNTED)), np.int64)
+    for k, (_, name) in enumerate(_COUNTED):
+        if (values := columns.get(name)) is not None:
+            counts[:, k] = values[chosen]
+    with write_hdf5(path, KIND, n) as file:
+        group = file.create_group("df")
+        names = [name for name, *_ in (*_TABLE, *_COUNTED)]
+        regular = {f"{name}_variety": "regular" for name in ("axis0", "axis1", "block0_items", "block1_items")}
+        texts = {"CLASS": "GROUP", "TITLE": "", "VERSION": "1.0", "pandas_type": "frame", **regular}
+        _put_attributes(group, {**texts, "encoding": "UTF-8", "errors": "strict"})
+        group.attrs["ndim"], group.attrs["nblocks"] = np.int64(2), np.int64(2)
+        _put_array(group, "axis0", np.array(names, "S"), "string")
+        _put_array(group, "axis1", np.arange(n), "integer")
+        for block, (values, titles) in enumerate(((numbers, names[: len(_TABLE)]), (counts, names[len(_TABLE) :]))):
+            _put_array(group, f"block{block}_items", np.array(titles, "S"), "string")
+            _put_array(group, f"block{block}_values", values)
+
+
+def _label(path):
+    """Label of an HDF5 file of this package; None for other files."""
+    try:
+        return label_of(path)
+    except FileError:
+        return None
+
+
+def _put_array(group, name, values, kind=None):
+    """Write an array with the attributes of pandas."""
+    dataset = put_field(group, name, values)
+    dataset.attrs["transposed"] = np.uint8(1)
+    _put_attributes(dataset, {"CLASS": "CARRAY", "TITLE": "", "VERSION": "1.1", "FLAVOR": "numpy"})
+    if kind:
+        _put_attributes(dataset, {"kind": kind})
+    if kind == "string":
+        _put_attributes(dataset, {"nan_rep": "nan"})
+
+
+def _put_attributes(item, texts):
+    """Write texts of fixed length as attributes, as PyTables does."""
+    for name, text in texts.items():
+        if text:
+            item.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
+        else:
+            item.attrs[name] = h5py.Empty("S1")
 
 
 def is_pyccapt(file: CheckedFile) -> bool:

@@ -13,7 +13,7 @@ from apt_evap._common.files import FileError, check_path
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_kind
-from apt_evap.io._texts import is_compressed, read_bytes, read_head, without_compression
+from apt_evap.io._texts import SYMBOLS, is_compressed, read_bytes, read_head, without_compression
 from apt_evap.io.lammps import Atoms, checked_frame, is_data, is_dump, read_data, read_dump
 from apt_evap.io.tapsim_nodes import is_nodes, read_nodes
 from apt_evap.io.xyz_atoms import is_xyz, read_xyz
@@ -141,6 +141,11 @@ def tip_of(path: AnyPath, atoms: Atoms, names: Mapping[str, Material | str], **o
             f"{name!r} has types without a name, expected the element of each, such as types={{{unnamed[0]}: 'Al'}}, "
             f"got none for {', '.join(unnamed)!s:.100}"
         )
+    odd = {kind: kind.capitalize() for kind in kinds if kind not in (*names, *SYMBOLS)}
+    odd = {kind: symbol for kind, symbol in odd.items() if symbol in SYMBOLS}
+    if odd:
+        shown = dict(list(odd.items())[:8])
+        raise FileError(f"{name!r} has types that are no chemical symbols: name their elements, such as types={shown}")
     number = {kind: k for k, kind in enumerate(kinds)}
     try:
         arguments: dict[str, Any] = {

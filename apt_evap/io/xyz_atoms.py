@@ -70,7 +70,7 @@ def read_xyz(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
     if name is None or width != 3:
         raise FileError(f"{where}: expected columns species and pos of each atom, got {', '.join(columns)!s:.100}")
     texts_of = [columns[key][0] for key in (name, "evaporable") if key in columns]
-    texts, values = atom_table(rows, texts_of, range(place, place + 3), where)
+    texts, values = atom_table(rows, texts_of, range(place, place + 3), where, lines, start + 2)
     types, evaporable = texts[0], None
     if name == "z":
         symbols = dict(zip(map(str, range(1, len(SYMBOLS) + 1)), SYMBOLS, strict=True))

@@ -39,6 +39,7 @@ from apt_evap.analysis.ion_image import critical_distance, tunnel_factor
 from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import read_config
+from apt_evap.detection.hits import Hits
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
 from apt_evap.emission.surface_frame import tangent_frame, target_shares
@@ -578,7 +579,7 @@ CASES = [
     row(ae.load, path=["a\x00b", "none.h5"]),
     row(ae.read, path=["a\x00b", "none.epos"]),
     row(ae.io.read_ranges, path=["a\x00b", "none.rrng"]),
-    row(ae.write, {"path": "a.epos", "hits": hits}, path=["a\x00b", "a.txt", "a.h5"]),
+    row(ae.write, {"path": "a.epos", "hits": hits}, path=["a\x00b", "a.txt", "a.apt"]),
     row(ae.write, {"path": "a.epos", "hits": hits}, format=[b".pos", ".txt"]),
     row(
         ae.emission.charge_state_ratio,
@@ -937,3 +938,11 @@ def test_everything_says_in_one_line_what_it_holds(ready, tmp_path):
         assert "\n" not in repr(thing) and len(repr(thing)) < 260 and "0x" not in repr(thing)
     assert repr(run.responses) == "<Responses: 12 ions, 46 coefficients from the site, 56 rolled up>"
     assert "evaporated atoms" in repr(emitter.evaporate(1))
+
+
+def test_numbers_of_numpy_look_like_those_of_python():
+    one, two = np.float64(3), np.int32(1)
+    assert short_text(one) == "3.0" and short_text((one, [two])) == "(3.0, [1])"
+    assert short_text({"a": np.bool_(True)}) == "{'a': True}"
+    with pytest.raises(ValueError, match=r"got \(3\.0, 1\)$"):
+        Hits(x=[1.0], y=[2.0]).window(x=(one, two))

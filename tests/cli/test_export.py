@@ -48,12 +48,19 @@ def test_measured_ions_in_other_formats(folder, capsys):
         assert file["entry1/specimen/atom_types"].asstr()[()] == "Al, Cu"
     assert main(["export", "oxcart.h5", "-o", "oxcart.csv", "--ions", "0,10"]) == 0
     assert len((folder / "oxcart.csv").read_text().splitlines()) == 11
+    form = ["--decimals", "2", "--separator", "semicolon", "--ions", "0,10", "--force"]
+    assert main(["export", "oxcart.h5", "-o", "oxcart.csv", *form]) == 0
+    assert ae.read("oxcart.csv").x.tolist() == np.round(here.x[:10], 2).tolist()
+    assert main(["export", "oxcart.epos", "-o", "again.h5"]) == 0
+    np.testing.assert_array_equal(ae.read("again.h5").x.astype("f4"), there.x)
     assert main(["export", "results", "-o", "again.tapsim"]) == 0 and len(ae.read("again.tapsim")) == 30
     capsys.readouterr()
     for command, message in (
         (["oxcart.h5", "-o", "b.nxs"], "--elements is missing, such as Si,O"),
         (["oxcart.h5", "-o", "b.epos", "--elements", "Al"], "--elements is for an .nxs file, got 'b.epos'"),
         (["oxcart.h5", "-o", "b.nxs", "--elements", "al"], "elements must be chemical symbols"),
+        (["oxcart.h5", "-o", "b.epos", "--decimals", "2"], "--decimals is for a .csv file, got 'b.epos'"),
+        (["oxcart.h5", "-o", "oxcart.h5", "--force"], "'oxcart.h5' is the file that is read: -o needs another name"),
         (["oxcart.h5", "-o", "b.epos", "--jitter", "1"], "--jitter needs a run (.h5), 'oxcart.h5' contains measured"),
     ):
         assert main(["export", *command]) == 2 and message in capsys.readouterr().err

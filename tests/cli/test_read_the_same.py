@@ -27,6 +27,7 @@ OPTIONS = {
     "unit": ["ions.epos", "--unit", "cm"],
     "voltage_unit": ["volts.epos", "--voltage-unit", "V"],
     "undistort": ["ions.epos", "--undistort", "grid.csv"],
+    "exchange_axes": ["ions.epos", "--undistort", "exchanged.csv", "--exchange-axes"],
     "distance": ["times.raw", "--distance", "90.12345", "--mass", "25,33.3"],
     "time_zero": ["times.raw", "--distance", "90", "--t0", "12.5", "--mass", "25,33.3"],
     "ions": ["ions.epos", "--ions", "100,15000"],
@@ -76,6 +77,7 @@ def files(tmp_path_factory):
     nodes = [(i, j) for i in range(-9, 10) for j in range(-9, 10)]
     lines = ["detectorX,detectorY,gridX,gridY", *(f"{i * 4 + 0.08 * i * i},{j * 4},{i},{j}" for i, j in nodes)]
     (folder / "grid.csv").write_text("\n".join(lines))
+    (folder / "exchanged.csv").write_text("\n".join(["detectorY,detectorX,gridX,gridY", *lines[1:]]))
     (folder / "-ranges.rrng").write_text("[Ranges]\nRange1=28.8 29.2 Ni:1\nRange2=10 20.5 B:1\n")
     counts = ions.map(bins=40)
     names = ("v", "x", "y")

@@ -91,6 +91,11 @@ def test_the_last_column_is_consistent_where_a_plain_reading_says_so(tmp_path, i
     while at < len(ions) and ions[at] > 0 and ions[at + 1 : at + ions[at]] == [0] * (ions[at] - 1):
         expected += [ions[at]] * ions[at]
         at += ions[at]
+    if len(expected) != len(ions):  # or the number for each ion of a pulse
+        at = 0
+        while at < len(ions) and ions[at] > 0 and ions[at : at + ions[at]] == [ions[at]] * ions[at]:
+            at += ions[at]
+        expected = ions if at == len(ions) else []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         hits = read(path)
@@ -100,6 +105,21 @@ def test_the_last_column_is_consistent_where_a_plain_reading_says_so(tmp_path, i
     else:
         assert hits.multiplicity is None and len(caught) == 2
     assert_joined(parts, hits)
+
+
+@given(sizes=st.lists(st.integers(1, 4), min_size=1, max_size=15), more=st.integers(0, 8), cut=st.integers(0, 1))
+def test_numbers_for_every_ion_of_a_pulse(tmp_path, sizes, more, cut):
+    path = tmp_path / "a.epos"
+    numbers = np.repeat(sizes, sizes).tolist()
+    rows = epos(numbers)
+    path.write_bytes(rows[:-10] if cut and len(numbers) > 1 else rows)
+    whole = read(path, partial=bool(cut))
+    kept = len(whole)
+    assert whole.multiplicity.tolist() == numbers[:kept]
+    assert whole.pulse_id.tolist() == np.repeat(np.arange(len(sizes)), sizes).tolist()[:kept]
+    parts = list(chunks(path, max(sizes) + more, partial=bool(cut)))
+    assert_joined(parts, whole)
+    assert max(map(len, parts)) <= max(sizes) + more
 
 
 def test_what_is_absent_and_in_kilovolts_is_told_by_the_whole_file(tmp_path):

@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import apt_evap as ae
+from apt_evap._common.files import FileError
+from apt_evap.io.formats import read
 
 X, Y = np.linspace(-2.0, 2.0, 21), np.linspace(-1.0, 1.0, 11)
 COUNTS = np.random.default_rng(1).poisson(5.0, (10, 20)).astype(np.int16)
@@ -147,3 +149,10 @@ def test_a_shape_larger_than_its_data_takes_no_memory(tmp_path):
         assert tracemalloc.get_traced_memory()[1] < 1 << 24  # a hundredth of the 12 GB of the shape would be too much
     finally:
         tracemalloc.stop()
+
+
+def test_another_zip_is_named(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("ions.epos", bytes(440))
+    with pytest.raises(FileError, match=r"a\.zip' .*: it is a \.zip archive with 'ions\.epos': unpack it"):
+        read(tmp_path / "a.zip")

@@ -1,12 +1,17 @@
 """HDF5 files of PyCCAPT, of the instrument and of the calibration."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
 from ion_files import pyccapt_calibrated, pyccapt_instrument
 
+import apt_evap as ae
 from apt_evap._common.files import FileError
-from apt_evap.io.formats import read
+from apt_evap.detection.hits import Hits
+from apt_evap.io.formats import read, write
+from apt_evap.warnings import DataWarning
 
 
 def test_every_column_of_the_instrument(tmp_path):
@@ -137,3 +142,72 @@ def test_a_table_of_pandas_is_named(tmp_path):
         file["df/table"] = np.zeros(3, [("index", "i8"), ("values_block_0", "f8", 4)])
     with pytest.raises(FileError, match=r"a\.h5' contains a table of pandas .*, expected format='fixed'"):
         read(tmp_path / "a.h5")
+
+
+def ions(n=300):
+    random = np.random.default_rng(4)
+    x, y, volts, pulse, mass, times = (random.uniform(low, high, n).astype("f4") for low, high in BOUNDS)
+    return Hits(
+        x=x, y=y, voltage=volts, pulse_voltage=pulse, mass_to_charge=mass, time_of_flight=times,
+        positions=random.normal(size=(n, 3)).astype("f4"), pulses=random.integers(0, 50, n).astype("u4"),
+        pulse_id=np.arange(n) // 2, multiplicity=np.full(n, 2),
+    )  # fmt: skip
+
+
+BOUNDS = ((-30, 30), (-30, 30), (3e3, 5e3), (500, 800), (10, 60), (300, 900))
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    hits = ions()
+    write(tmp_path / "a.h5", hits)
+    again = read(tmp_path / "a.h5")
+    assert set(again.columns) == set(hits.columns)
+    for name in hits.columns:  # cm and mm differ by a rounding of float64
+        values = getattr(hits, name)
+        np.testing.assert_array_equal(getattr(again, name).astype(values.dtype), values, name)
+    assert again.extra["start_counter"].tolist() == (hits.pulse_id + 1).tolist()
+    kept = replace(hits, extra={"start_counter": np.arange(300) // 2 + 7, "laser_pulse": np.full(300, 2.5)})
+    write(tmp_path / "b.h5", kept)
+    assert read(tmp_path / "b.h5").extra["start_counter"].tolist() == kept.extra["start_counter"].tolist()
+    assert (read(tmp_path / "b.h5").extra["laser_pulse"] == 2.5).all()
+
+
+def test_pandas_reads_what_is_written(tmp_path):
+    """As PyCCAPT does: columns, types and values are those of a table that pandas itself has written."""
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("tables")
+    hits = ions()
+    write(tmp_path / "a.h5", hits)
+    table = pandas.read_hdf(tmp_path / "a.h5", mode="r")
+    names = (*[name for name in CALIBRATED if name not in ("multi", "start_counter")], "delta_p", "multi")
+    assert list(table.columns) == [*names, "start_counter"]
+    assert table.dtypes.astype(str).tolist() == 12 * ["float64"] + 3 * ["int64"]
+    np.testing.assert_array_equal(table["mc (Da)"], hits.mass_to_charge)
+    np.testing.assert_allclose(table["x_det (cm)"], hits.x / 10, rtol=1e-7)
+    np.testing.assert_array_equal(table[["x (nm)", "y (nm)", "z (nm)"]], hits.positions)
+    assert (table["multi"] == 2).all() and (table["mc_uc (Da)"] == 0).all()
+    table.to_hdf(tmp_path / "b.h5", key="df", mode="w")
+    one, two = read(tmp_path / "a.h5"), read(tmp_path / "b.h5")
+    assert one.columns == two.columns
+    assert all(np.array_equal(getattr(one, name), getattr(two, name)) for name in one.columns)
+
+
+def test_a_run_is_not_replaced_by_ions(tmp_path, small_tip):
+    run = ae.Simulation(small_tip, seed=1, n_threads=1).run(3)
+    run.save(tmp_path / "a.h5")
+    before = (tmp_path / "a.h5").read_bytes()
+    with pytest.raises(FileError, match=r"a\.h5' is a run, which ions do not replace"):
+        write(tmp_path / "a.h5", ions())
+    assert (tmp_path / "a.h5").read_bytes() == before
+    write(tmp_path / "b.h5", ions())
+    write(tmp_path / "b.h5", ions(20))
+    assert len(read(tmp_path / "b.h5")) == 20
+    with pytest.raises(ValueError, match="x"):
+        write(tmp_path / "c.h5", Hits(mass_to_charge=[1.0]))
+
+
+def test_a_start_counter_that_decreases_is_warned_of(tmp_path):
+    counter = np.array([5, 5, 6, 6, 2, 2, 7, 7])
+    pyccapt_instrument(tmp_path / "a.h5", start_counter=counter)
+    with pytest.warns(DataWarning, match="pulses uncertain.*the number decreases at 1 rows"):
+        assert read(tmp_path / "a.h5").pulse_id.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]

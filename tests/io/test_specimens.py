@@ -127,8 +127,9 @@ def test_types_without_a_name_are_refused(save):
         ("ITEM: ATOMS", "ITEM: THINGS", "no line ITEM: ATOMS"),
         ("type x y z", "type x y", "no columns x y z"),
         ("id type x", "id kind x", "no column type, typelabel or element"),
-        ("\n2 1 ", "\n2 1 red ", "expected numbers for the coordinates"),
-        ("\n2 1 ", "\n2 1 nan ", "expected finite coordinates"),
+        ("\n2 1 ", "\n2 1 red ", "line 11: expected 5 columns or more with finite coordinates of an atom, got '2 1 r"),
+        ("\n2 1 ", "\n2 1 nan ", "line 11: expected 5 columns or more with finite coordinates of an atom, got '2 1 n"),
+        ("\n2 1 ", "\n\n2 1 ", "line 11: expected 5 columns or more with finite coordinates of an atom, got ''"),
     ],
 )
 def test_dumps_that_are_wrong(save, old, new, message):
@@ -387,7 +388,8 @@ def test_xyz_with_any_names_of_types(save):
         (xyz(symbols).replace("12", "13", 1), "states 13 atoms but contains 12"),
         (xyz(symbols, comment="Properties=species:S:1:force:R:3"), "expected columns species and pos of each atom"),
         (xyz(symbols, comment="Properties=species:S:x"), "expected Properties=species:S:1:pos:R:3"),
-        (xyz(symbols).replace("Cu", "Cu x"), "expected numbers for the coordinates"),
+        (xyz(symbols).replace("Cu", "Cu x", 1), "line 11: expected 4 columns or more with finite coordinates"),
+        (xyz(["AL"] * 8 + ["Cu"] * 4), r"no chemical symbols: name their elements, such as types=\{'AL': 'Al'\}"),
     ):
         with pytest.raises(FileError, match=rf"a\.xyz'.*{message}"):
             ae.read_tip(save(text, "a.xyz"))

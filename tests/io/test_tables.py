@@ -61,6 +61,29 @@ def test_a_csv_is_read_back(tmp_path, dtype):
         np.testing.assert_array_equal(again.extra[name], column)
 
 
+@pytest.mark.parametrize(("separator", "divider"), [("comma", ","), ("semicolon", ";"), ("tab", "\t")])
+def test_decimals_and_separators_of_a_csv(tmp_path, separator, divider):
+    x = np.array([1.23456, -0.0004, 217.891])
+    label = np.array(["a;b", "a,b", "a\tb"])
+    hits = Hits(x=x, y=-x, pulse_id=[0, 1, 1], multiplicity=[1, 2, 2], extra={"label": label})
+    write(tmp_path / "a.csv", hits, decimals=3, separator=separator)
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    assert lines[0].split(divider)[:2] == ["x [mm]", "y [mm]"]
+    assert lines[3].split(divider)[:2] == ["217.891", "-217.891"]
+    again = read(tmp_path / "a.csv")
+    assert again.x.tolist() == [1.235, 0, 217.891] and again.pulse_id.tolist() == [0, 1, 1]
+    assert again.extra["label"].tolist() == label.tolist()
+    write(tmp_path / "a.csv", hits, separator=separator)
+    assert read(tmp_path / "a.csv").x.tolist() == x.tolist()
+
+
+@pytest.mark.parametrize("options", [{"decimals": -1}, {"decimals": 18}, {"separator": ";"}, {"decimals": 1.5}])
+def test_forms_of_a_csv_that_are_wrong(tmp_path, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        write(tmp_path / "a.csv", Hits(x=[1.0], y=[2.0]), **options)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
