@@ -52,7 +52,7 @@ def do(sweep, key):
 
 def command(sweep, *options, **environment):
     """`apt-evap sweep work` as a process."""
-    words = [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--quiet", *options]
+    words = [sys.executable, "-P", "-m", "apt_evap", "sweep", "work", str(sweep.folder), "--quiet", *options]
     return subprocess.Popen(words, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
 
 

@@ -118,8 +118,8 @@ build)
             -shared FILE -o "$module" "$folder/packages/libpython311.a"'
     ;;
 example)
-    windows_python -m apt_evap.cli run examples/ni111.toml "$@" -o "Z:$folder/ni111.h5"
-    windows_python -m apt_evap.cli info "Z:$folder/ni111.h5" | grep -i fingerprint
+    windows_python -m apt_evap run examples/ni111.toml "$@" -o "Z:$folder/ni111.h5"
+    windows_python -m apt_evap info "Z:$folder/ni111.h5" | grep -i fingerprint
     ;;
 test)
     # this CPython ignores PYTHONPATH, so that a test cannot put a module in place of another

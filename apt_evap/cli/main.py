@@ -140,5 +140,5 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-if __name__ == "__main__":  # python -m apt_evap.cli.main, as python -m apt_evap.cli
+if __name__ == "__main__":  # python -m apt_evap.cli.main, as python -m apt_evap
     sys.exit(main())

@@ -10,8 +10,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.description = (
         "Spacing and normal of the lattice planes in a cylinder of reconstructed ions, such as at a pole, and how\n"
-        "sharp they are. The true spacing calibrates the reconstruction: multiply the efficiency by the observed\n"
-        "spacing divided by the true one."
+        "sharp they are, beside what chance makes of ions without planes. The true spacing calibrates the\n"
+        "reconstruction: multiply the efficiency by the observed spacing divided by the true one."
     )
     parser.epilog = (
         "example:\n"
@@ -44,29 +44,31 @@ def execute(options: argparse.Namespace) -> int:
     from apt_evap._common.validation import check_number
     from apt_evap.cli._files import file_of, read
     from apt_evap.detection.hits import Hits
-    from apt_evap.reconstruction.calibration import find_planes
+    from apt_evap.reconstruction.lattice_planes import find_planes
 
     content = read(options)
     if not isinstance(content, Hits) or content.positions is None:
         raise ValueError(f"planes needs reconstructed ions, {options.file!r} has no positions: reconstruct it first")
     positions = file_of(options).select(content).positions
+    true = None if options.spacing is None else check_number(options.spacing, "--spacing", above=0, unit="nm")
     at = None if options.at is None else _place(options.at)
-    planes, normal, tilt = find_planes(positions, at, radius=options.radius, widest=options.tilt, reach=options.reach)
+    planes = find_planes(positions, at, radius=options.radius, widest=options.tilt, reach=options.reach)
+    tell(options, str(planes))
     result = {
         "file": options.file,
-        "spacing": planes.spacing,
+        "found": planes.found,
         "amplitude": planes.amplitude,
-        "depth_resolution": planes.depth_resolution,
-        "normal": normal.tolist(),
-        "tilt": tilt,
+        "amplitude_by_chance": planes.by_chance.max(),
+        "spacing": planes.spacing,
+        "spacing_error": planes.spacing_error,
+        "depth_resolution": planes.distances.depth_resolution,
+        "normal": planes.normal.tolist(),
+        "tilt": planes.tilt,
     }
-    tell(options, f"spacing {planes.spacing:.4f} nm, amplitude {planes.amplitude:.3f} (1 for perfect planes)")
-    tell(options, f"scatter about the planes {planes.depth_resolution:.3f} nm, of {planes.references:,} ions")
-    tell(options, f"normal ({', '.join(f'{part:.3f}' for part in normal)}), {tilt:.1f} degrees from z")
-    if options.spacing is not None:
-        factor = planes.spacing / check_number(options.spacing, "--spacing", above=0, unit="nm")
+    if true is not None and planes.found:
+        factor = planes.spacing / true
         result["efficiency_factor"] = factor
-        tell(options, f"the spacing is {options.spacing:g} nm with {factor:.3f} times the efficiency")
+        tell(options, f"the spacing is {true:g} nm with {factor:.3f} times the efficiency")
     tell_json(options, result)
     return 0
 

@@ -2,10 +2,11 @@
 from .assumed_constants import assumptions as assumptions
 from .calibration import compression_from_poles as compression_from_poles
 from .calibration import distribution_map as distribution_map
-from .calibration import find_planes as find_planes
 from .consistency import checks as checks
 from .constants import run_constants as run_constants
 from .evolving import EvolvingReconstruction as EvolvingReconstruction
+from .lattice_planes import LatticePlanes as LatticePlanes
+from .lattice_planes import find_planes as find_planes
 from .origins import origin_table as origin_table
 from .position_errors import local_scatter as local_scatter
 from .position_errors import position_covariances as position_covariances

@@ -14,8 +14,6 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_count, check_number, short_text
 
 _CHUNK = 1024  # reference ions at a time
-_FEWEST_OF_PLANES = 50  # ions
-_PAIRS_OF_PLANES = 20_000  # for a normal in the search: an amplitude within 0.01
 _HARMONIC = 0.5  # the fundamental has at least this fraction of the largest amplitude: harmonics can be as large
 
 
@@ -170,90 +168,8 @@ def distribution_map(
     if not counts.any():
         raise ValueError(f"no two ions are within {lateral:g} nm across and {reach:g} nm along the axis, got no pair")
     edges = np.linspace(-reach, reach, bins + 1)
-    spacing, amplitude = _period((edges[:-1] + edges[1:]) / 2, counts, reach)
+    spacing, amplitude = period_of((edges[:-1] + edges[1:]) / 2, counts, reach)
     return DistributionMap(edges, counts, references, spacing, amplitude)
-
-
-def find_planes(
-    positions: ArrayLike,
-    at: ArrayLike | None = None,
-    *,
-    radius: float = 1.0,
-    widest: float = 10.0,
-    reach: float = 1.0,
-) -> tuple[DistributionMap, Floats, float]:
-    """Lattice planes in a cylinder of reconstructed ions: their spacing, and the normal for which they are sharpest.
-
-    Parameters
-    ----------
-    positions : array_like
-        Reconstructed positions [nm], shape (n, 3).
-    at : array_like, optional
-        x and y of the axis of the cylinder, which is along z [nm], shape (2,); by default the mean of the ions.
-    radius : float
-        Radius of the cylinder [nm].
-    widest : float
-        Largest angle of the normal from z [degrees]; 0 for z itself.
-    reach : float
-        Largest distance of two ions along the normal [nm]; several spacings.
-
-    Returns
-    -------
-    DistributionMap
-        Distances along the normal.
-    normal : ndarray, shape (3,)
-        Unit vector, with z > 0.
-    tilt : float
-        Its angle from z [degrees].
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than 50 ions in the cylinder.
-
-    Notes
-    -----
-    Normals about 2 degrees apart are compared with 20,000 pairs, then refined by a simplex.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(1)
-    >>> ions = rng.random((2000, 3)) * (4, 4, 0) + rng.integers(0, 20, (2000, 1)) * (0, 0, 0.2)
-    >>> planes, normal, tilt = ae.reconstruction.find_planes(ions)
-    >>> round(planes.spacing, 3), bool(tilt < 0.5)
-    (0.2, True)
-    """
-    points = check_array(positions, "positions", ("n", 3))
-    radius = check_number(radius, "radius", above=0, unit="nm")
-    widest = check_number(widest, "widest", at_least=0, at_most=60, unit="degrees")
-    reach = check_number(reach, "reach", above=0, unit="nm")
-    centre = points[:, :2].mean(axis=0) if at is None else check_array(at, "at", (2,))
-    chosen = points[np.hypot(*(points[:, :2] - centre).T) <= radius]
-    if len(chosen) < _FEWEST_OF_PLANES:
-        raise ValueError(f"the cylinder must hold at least {_FEWEST_OF_PLANES} ions, got {len(chosen)}")
-
-    def along(tilts):
-        x, y = np.tan(np.radians(tilts))
-        return np.array([x, y, 1.0]) / math.sqrt(x * x + y * y + 1)
-
-    def blur(tilts):
-        if float(np.hypot(*tilts)) > widest:
-            return 0.0
-        try:
-            return -distribution_map(chosen, along(tilts), reach=reach, max_pairs=_PAIRS_OF_PLANES).amplitude
-        except ValueError:  # no pair
-            return 0.0
-
-    steps = np.linspace(-widest, widest, 2 * math.ceil(widest / 2) + 1) if widest else np.zeros(1)
-    start = min(((x, y) for x in steps for y in steps), key=blur)
-    best = start
-    if widest:
-        options = {"xatol": 0.05, "fatol": 1e-4, "initial_simplex": np.add(start, [(0, 0), (0.8, 0), (0, 0.8)])}
-        found = scipy.optimize.minimize(blur, start, method="Nelder-Mead", options=options)
-        best = tuple(found.x) if found.fun < blur(start) else start
-    normal = along(best)
-    tilt = math.degrees(math.acos(min(1.0, normal[2])))
-    return distribution_map(chosen, normal, reach=reach), normal, tilt
 
 
 def _frame(axis: Any) -> Floats:
@@ -290,22 +206,33 @@ def _pair_counts(across, along, lateral, reach, bins, max_pairs, seed):
     return counts, done
 
 
-def _period(distances, counts, reach):
-    """Period of the counts and its Fourier amplitude, divided by that of the sum."""
+def frequencies_of_planes(reach: float, width: float) -> Floats:
+    """Frequencies [1/nm] of the periods that are compared, from reach / 1.5 to four bins of this width [nm]."""
+    return np.arange(1.5 / reach, 1 / (4 * width), 0.05 / reach)
+
+
+def period_of(distances: Floats, counts: Any, reach: float, waves: Floats | None = None) -> tuple[float, float]:
+    """Period of the counts of equal bins [nm] and its Fourier amplitude, divided by that of the sum.
+
+    The cosines of `frequencies_of_planes` at the distances, if known, are `waves`.
+    """
     weights = counts * np.cos(math.pi * distances / (2 * reach)) ** 2
     total = float(weights.sum())
     width = float(distances[1] - distances[0])
+    frequencies = frequencies_of_planes(reach, width)
 
     def amplitude(frequency):
         return float(weights @ np.cos(2 * math.pi * frequency * distances)) / total
 
-    step = 0.05 / reach
-    frequencies = np.arange(1.5 / reach, 1 / (4 * width), step)
-    amplitudes = np.array([amplitude(frequency) for frequency in frequencies])
+    if waves is None:
+        amplitudes = np.array([amplitude(frequency) for frequency in frequencies])
+    else:
+        amplitudes = waves @ weights / total
     peaks = np.flatnonzero((amplitudes[1:-1] >= amplitudes[:-2]) & (amplitudes[1:-1] > amplitudes[2:])) + 1
     if not len(peaks):
         return math.nan, 0.0
     first = peaks[amplitudes[peaks] >= _HARMONIC * amplitudes[peaks].max()][0]
+    step = 0.05 / reach
     best = scipy.optimize.minimize_scalar(
         lambda frequency: -amplitude(frequency),
         bounds=(frequencies[first] - step, frequencies[first] + step),

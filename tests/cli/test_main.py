@@ -720,7 +720,7 @@ def test_wrong_arguments_are_one_sentence(folder, capsys, arguments, sentence):
     assert sentence in failed(capsys, *arguments)
 
 
-@pytest.mark.parametrize("module", ["apt_evap.cli", "apt_evap.cli.main"])
+@pytest.mark.parametrize("module", ["apt_evap", "apt_evap.cli.main"])
 def test_the_command_line_is_a_module(module):
     told = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True)
     assert (told.returncode, told.stdout) == (0, f"apt-evap {__version__}\n")

@@ -17,7 +17,7 @@ def test_a_picture_whatever_the_matplotlibrc(tmp_path):
     ae.write(tmp_path / "a.epos", ae.Hits(x=x, y=y, mass_to_charge=np.full(500, 28.0), voltage=np.full(500, 5e3)))
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nsavefig.dpi: 7\n")
     done = subprocess.run(
-        [sys.executable, "-m", "apt_evap.cli", "map", "a.epos", "-o", "a.png"],
+        [sys.executable, "-m", "apt_evap", "map", "a.epos", "-o", "a.png"],
         cwd=tmp_path,
         capture_output=True,
         text=True,

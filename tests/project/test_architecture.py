@@ -49,7 +49,7 @@ def cython_imports(source):
 def graph_of(package):
     """Modules that each module of a package imports, by dotted name."""
     paths = {module_of(path, package): path for path in sorted(package.rglob("*.py")) if path.parent != package}
-    paths |= {module_of(path, package): path for path in package.glob("*.py") if path.name != "__init__.py"}
+    paths |= {module_of(path, package): path for path in package.glob("*.py") if not path.name.startswith("__")}
     compiled = {module_of(path, package) for path in package.rglob("*.p[yx][xd]")}
     graph = {module: set() for module in (*paths, *compiled)}
     for module, path in paths.items():

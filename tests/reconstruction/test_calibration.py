@@ -105,3 +105,17 @@ def test_the_compression_from_poles():
     )
     with pytest.raises(ValueError, match="observed_angles"):
         ae.reconstruction.compression_from_poles([54.74], [0.0])
+
+
+def test_planes_are_found_where_there_are_some_and_not_by_chance():
+    rng = np.random.default_rng(4)
+    ions = rng.random((600, 3)) * (2, 2, 6)
+    chance = [ae.reconstruction.find_planes(rng.random((300, 3)) * (2, 2, 6), widest=0).found for _ in range(4)]
+    assert sum(chance) <= 1  # 1 of 20; 6 of 150 and 3 of 60 were counted
+    layers = ions.copy()
+    layers[:, 2] = 0.2 * rng.integers(0, 30, 600) + 0.05 * rng.standard_normal(600)
+    planes = ae.reconstruction.find_planes(layers, widest=0)
+    assert planes.found
+    # the expected amplitude of a pair is exp(-4 pi² sigma²/d²)
+    assert planes.amplitude == pytest.approx(np.exp(-((2 * np.pi * 0.05 / 0.2) ** 2)), abs=0.03)
+    assert abs(planes.spacing - 0.2) < 4 * planes.spacing_error < 0.01

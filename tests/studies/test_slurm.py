@@ -25,7 +25,7 @@ def script(last):
     )
     text, n_arrays = re.subn(r"--array=\S+", f"--array=0-{last}", textwrap.dedent(block[1]).strip())
     assert n_arrays == 1 and text.startswith("#!/bin/bash\n") and "apt-evap sweep work" in text
-    return text.replace("exec apt-evap", "exec python -P -m apt_evap.cli") + "\n"
+    return text.replace("exec apt-evap", "exec python -P -m apt_evap") + "\n"
 
 
 def tasks(states="all"):

@@ -136,7 +136,7 @@ def test_an_interrupt_ends_the_work_at_any_time(tmp_path, moment):
 def test_a_terminal_interrupts_each_run_once(tmp_path):
     """A second interrupt would lose the ions since the last checkpoint."""
     sweep = planned(tmp_path, TWO_LONG, LONG)
-    words = [sys.executable, "-P", "-m", "apt_evap.cli", "sweep", "work", str(sweep.folder), "--workers", "2"]
+    words = [sys.executable, "-P", "-m", "apt_evap", "sweep", "work", str(sweep.folder), "--workers", "2"]
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
     until(lambda: has_begun(sweep, *sweep.keys))
     # two signals in succession are often one: the group of the terminal does not contain the runs
