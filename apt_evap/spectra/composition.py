@@ -7,6 +7,7 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 
+_LEAST_OF_OTHERS = 0.05  # at.%: less of an element that only other names have is not printed
 MOST_UNEXPLAINED = 0.1
 """Part of the ions in peaks without an explanation, above which there is no composition."""
 
@@ -22,7 +23,8 @@ class Composition:
     error : dict of str to float
         Standard errors of counting, with that of the shape of the peaks [at.%].
     span : dict of str to tuple of float
-        Lowest and highest value where peaks may have other names [at.%]; equal to the value if none has.
+        Lowest and highest value where peaks may have other names [at.%], also of elements that only these have; equal
+        to the value if no peak has.
     unexplained : float
         Part of the ions in peaks that no ion explains.
     refused : str
@@ -47,6 +49,9 @@ class Composition:
             error = self.error[element]
             other = f" ({low:.2f} to {high:.2f} with other names)" if high - low > max(error, 0.005) else ""
             lines.append(f"{element}: {value:.2f} ± {error:.2f} at.%{other}")
+        for element, (_, high) in self.span.items():
+            if element not in self.at_percent and high > _LEAST_OF_OTHERS:
+                lines.append(f"perhaps {element}: 0 to {high:.2f} at.% with other names")
         return "\n".join(lines)
 
     def plain(self) -> dict[str, object]:
@@ -96,15 +101,15 @@ class Amounts:
         for atoms, ions in self.others:
             other = _atoms_of(atoms, ions)
             every = sum(other.values())
-            if every > 0:
-                for element, bounds in span.items():
-                    value = 100 * other.get(element, 0.0) / every
-                    bounds[:] = min(bounds[0], value), max(bounds[1], value)
+            for element in {**span, **other} if every > 0 else ():
+                value = 100 * other.get(element, 0.0) / every
+                low, high = span.get(element, (0.0, 0.0))
+                span[element] = [min(low, value), max(high, value)]
         order = sorted(share, key=lambda element: -share[element])
         return Composition(
             {element: share[element] for element in order},
             {element: errors[element] for element in order},
-            {element: (span[element][0], span[element][1]) for element in order},
+            {element: (span[element][0], span[element][1]) for element in [*order, *sorted({*span} - {*order})]},
             unexplained,
         )
 

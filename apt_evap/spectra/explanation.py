@@ -13,12 +13,13 @@ from apt_evap.spectra.candidate_ions import atomic_ions
 from apt_evap.spectra.ion_choice import IonChoice
 from apt_evap.spectra.ion_fit import LIGHT, IonFit
 from apt_evap.spectra.ion_names import GASES, Abundances, Ion, atoms_of_formula, element_of
+from apt_evap.spectra.ion_profiles import IonProfiles
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import Contents, PeakContents
 from apt_evap.spectra.peak_scale import HIGHEST, LOWEST
 
 _SHAPE = 0.02  # relative error of a content while ions are chosen: the shape of a peak
-_FINAL_SHAPE = 0.003  # relative error of a content where all peaks have an ion
+_FINAL_SHAPE = 0.003  # relative error of the number of an ion by the shape of its peaks
 _WINDOWS = (0.005, 0.005, 0.004, 0.004)  # relative distance of peaks from their ions, in each round
 _MOST_IONS = (14, 24, 60, 60)
 _OWN_SHIFT = 5e-4  # of the peaks of an ion of its own, once the others have names
@@ -26,6 +27,7 @@ _ALIKE = 30.0
 """Chi-squared and costs by which another name of a peak may be worse: then both are named."""
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60
+_MANY = 0.01  # of all ions: an element with such an ion is there
 _SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no other set is tried
 _ONE_LINE = 0.03  # of all ions, from which one line may show an element
 _KNOWN = 1e-3  # error of the calibration, below which it may
@@ -134,24 +136,35 @@ class Explainer:
         if not len(seen):
             return np.zeros(0)
         old = choice.fit
+        sure = self._sure_elements(choice, chosen, amplitudes)
         probable = []
         for number in choice.candidates(chosen, amplitudes, every=True).tolist() + list(chosen):
             ion = old.ions[number]
             if ion is None:
                 continue
             masses, shares = self.abundances.lines(ion.formula)
-            probable.append((masses / ion.charge, shares))
-        places = [self.calibration.place(masses) for masses, _ in probable]
+            probable.append((masses / ion.charge, shares, ion.formula in sure))
+        places = [self.calibration.place(masses) for masses, _, _ in probable]
         needed = []
-        for place, (_, shares) in zip(places, probable, strict=True):
+        for place, (_, shares, known) in zip(places, probable, strict=True):
             main = place[int(np.argmax(shares))]
             distance = np.abs(np.log(seen / main))
             near = int(np.argmin(distance))
-            if distance[near] <= max(window, 2 * float(scale.sigma(seen[near]))):
+            if known or distance[near] <= max(window, 2 * float(scale.sigma(seen[near]))):
                 needed.append(
                     place[(shares > 0.01 * shares.max()) & (place > 1.02 * LOWEST) & (place < 0.98 * HIGHEST)]
                 )
         return self._without_peaks(np.concatenate(needed) if needed else np.zeros(0))
+
+    def _sure_elements(self, choice, chosen, amplitudes):
+        """Elements that the user gives, and those with many atomic ions: all their charge states may be in tails."""
+        total = max(float(np.sum(amplitudes)), 1e-9)
+        found = {
+            ion.formula
+            for ion, x in ((choice.fit.ions[number], x) for number, x in zip(chosen, amplitudes, strict=True))
+            if ion is not None and ion.formula in choice.elements and x > _MANY * total
+        }
+        return found | (self.allowed or set())
 
     def _without_peaks(self, places):
         """Those of some places [Da] that no peak and no other place is near."""
@@ -358,12 +371,10 @@ class Explainer:
         return chosen
 
     def amounts(self, fit: IonFit, chosen: Sequence[int]) -> tuple[Floats, Floats]:
-        """Ions of each of some ions with their covariance, from the contents alone, with the errors of counting."""
-        from scipy.optimize import nnls
-
+        """Ions of each of some ions with their covariance, by the likelihood of the spectrum."""
         if not len(chosen):
             return np.zeros(0), np.zeros((0, 0))
-        contents = fit.contents
-        error = np.sqrt(contents.variance + (_FINAL_SHAPE * contents.ions) ** 2)
-        system = (fit.shares[np.asarray(chosen, int)] / error).T
-        return nnls(system, contents.ions / error)[0], np.linalg.pinv(system.T @ system)
+        shares = fit.shares[np.asarray(chosen, int)]
+        profiles = IonProfiles(self.peaks, fit.contents, shares, fit.solve(chosen)[0])
+        ions, covariance = profiles.amounts_of_all()
+        return ions, covariance + np.diag((_FINAL_SHAPE * ions) ** 2)

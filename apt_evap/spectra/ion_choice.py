@@ -17,6 +17,7 @@ _RAREST = 0.005  # share of the atoms that counts as that of rarer ones
 _UNUSUAL = (
     15.0  # of unusual molecules, of three atoms of a metal, and of a charge of three or more without the one below
 )
+_PAIR = 40.0  # of two atoms of a metal with two charges, with or without hydrogen: at the m/n of one atom with one
 _NO_ATOMS = 60.0  # of an element without an atomic ion
 _HEAVY_GASES, _NO_GAS = ("C", "N", "O"), 20.0  # cost of one of these without an atomic ion; H is often in hydrides only
 UNNAMED = 40.0
@@ -24,7 +25,13 @@ UNNAMED = 40.0
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
 _TRIED = 8  # best ions that are fitted in each step
 _FEWEST, _LEAST = 20.0, 1e-5  # ions of an ion, and over all ions
+_AT_ONCE = 120.0  # by which chi-squared and costs may rise with all ions of an element, before others are left out
 _SHARED = 0.3  # of the ions of an ion, in the main peak of another that it may replace
+
+
+def _metals_of(atoms):
+    """Elements of an ion that are not those of gases."""
+    return {name for name in atoms if name not in (*GASES, "D")}
 
 
 class IonChoice:
@@ -85,6 +92,7 @@ class IonChoice:
                 atomic[at] = self._place[next(iter(counts))]
             metals = max((number for name, number in counts.items() if name not in (*GASES, "D")), default=0)
             unusual[at] = _UNUSUAL * (ion.formula in UNUSUAL or metals > 2)
+            unusual[at] += _PAIR * (ion.charge == 2 and metals == 2 and set(counts) - {"H", "D"} <= _metals_of(counts))
         self.atoms = np.vstack([self.atoms, atoms])
         self._charge = np.concatenate([self._charge, charge]).astype(int)
         self._atomic = np.concatenate([self._atomic, atomic]).astype(int)
@@ -219,8 +227,28 @@ class IonChoice:
             chosen, amplitudes, value, changed = self._exchanged(chosen, amplitudes, value)
             chosen, amplitudes, value = self.pruned(chosen, amplitudes, value)
             if not changed:
+                chosen, amplitudes, value, changed = self._with_elements(chosen, amplitudes, value)
+            if not changed:
                 break
         return chosen, amplitudes, value
+
+    def _with_elements(self, chosen, amplitudes, value):
+        """All atomic ions of one more element at once, while that is better without the ions that they displace."""
+        present, _ = self._present(np.asarray(chosen, int))
+        tried = self.candidates(chosen, amplitudes)
+        atomic, changed = self._atomic[tried], False
+        for at in np.unique(atomic[atomic >= 0]):
+            more = tried[atomic == at].tolist()
+            if present[at] or len(more) < 2:
+                continue
+            trial, chi2 = self.fit.solve([*chosen, *more])
+            if chi2 + self.cost([*chosen, *more]) > value + _AT_ONCE:
+                continue
+            every = [*chosen, *more]
+            every, trial, total = self.pruned(every, trial, chi2 + self.cost(every))
+            if total < value - 1e-6 and (trial >= self.least).all():
+                chosen, amplitudes, value, changed = every, trial, total, True
+        return chosen, amplitudes, value, changed
 
     def pruned(self, chosen: list[int], amplitudes: Floats, value: float) -> tuple[list[int], Floats, float]:
         """Without ions that cost more than they explain."""

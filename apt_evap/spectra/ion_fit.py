@@ -20,6 +20,7 @@ _WINDOW = 3.0  # standard deviations of a place
 _UNSEEN = 1.0  # added to the distance of a place without a peak: a peak comes first
 _JOINED = 2.5  # standard deviations of two lines that are one peak
 _OWN_LINE, _OWN_LINES = 0.02, 2  # abundance and number of lines elsewhere, for which an ion may have a part of it
+_HIDDEN = 10.0  # errors of its content, from which a place without a peak, in the tail of another, may be a main line
 _MISSED = 0.25  # part of the isotopes of an ion that may have no place in a spectrum
 
 Rows = NDArray[np.int64]
@@ -76,6 +77,7 @@ class IonFit:
         light = mass < LIGHT
         self.place_error = np.where(light, np.maximum(place, _LIGHT_ERROR), place)
         self._window = np.maximum(np.minimum(_WINDOW * self.place_error, np.where(light, _LIGHT_WINDOW, window)), sigma)
+        self._hidden = ions > _HIDDEN * np.sqrt(contents.variance)
         self._target = ions / self.error
         self.all_chi2 = float(self._target @ self._target)
         """Chi-squared without ions."""
@@ -155,7 +157,7 @@ class IonFit:
         """Whether ions have most of their isotopes in the spectrum, and a peak for the most abundant one."""
         if not self.number:
             return np.zeros(len(numbers), bool)
-        seen = self.contents.seen[self.main[numbers]]
+        seen = (self.contents.seen | self._hidden)[self.main[numbers]]
         return (self.missed[numbers] <= _MISSED) & (self.largest[numbers] > 0) & seen
 
     def _product(self, number):

@@ -40,9 +40,15 @@ class IonProfiles:
 
         Shapes and places of the peaks, and the shape of the background, are those of the whole spectrum.
         """
+        return self._amounts(self.peaks.scale.counts(mass))
+
+    def amounts_of_all(self) -> tuple[Floats, Floats]:
+        """The same of the whole spectrum."""
+        return self._amounts(self.peaks.counts)
+
+    def _amounts(self, counts):
         from scipy.sparse import csc_matrix, hstack
 
-        counts = self.peaks.scale.counts(mass)
         background = self.contents.background / max(float(self.contents.background.sum()), 1e-300)
         model = hstack([self._columns @ csc_matrix(self.shares.T), csc_matrix(background[:, None])]).tocsr()
         norm = np.maximum(np.asarray(model.sum(0)).ravel(), 1e-12)

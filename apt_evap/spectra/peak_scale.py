@@ -15,6 +15,7 @@ _STRONGEST = 30  # peaks whose widths are measured
 _FEWEST = 60  # ions of one half of such a peak
 _WIDTHS = (1e-4, 5e-3)  # of ln m/n; standard deviations are between these
 _MIRRORED = 0.3  # mean logarithm of the left width over the right one, from which tails are at low masses
+_SHARPER, _BROADER = 0.25, 0.2  # quantile of ln width that is of single isotopes, and how much more these may be
 _NOMINAL = 5e-4  # width without a peak
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
 _APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
@@ -93,13 +94,23 @@ def _widths(mass):
     if len(logs) < 3:
         return float(np.clip(math.exp(np.median(logs)), *_WIDTHS)), 0.0, mirrored
     best = math.inf, 0.0, 0.0
-    for power in np.arange(-0.6, 0.21, 0.1):  # sqrt(m) for errors of the time, m^0 for those of the energy
+    for power in np.arange(-0.6, 0.01, 0.1):  # sqrt(m) for errors of the time, m^0 for those of the energy
         rest = logs - power * at
         order = np.argsort(rest)
-        middle = rest[order][np.searchsorted(np.cumsum(weight[order]), weight.sum() / 2)]
-        cost = float((weight * np.abs(rest - middle)).sum() + 0.02 * abs(power) * weight.sum())
+        sharp = _quantile(rest[order], weight[order], _SHARPER)
+        # peaks that are several isotopes are too broad, and none is too sharp
+        cost = (weight * np.where(rest > sharp, _SHARPER, 1 - _SHARPER) * np.abs(rest - sharp)).sum()
+        cost = float(2 * cost + 0.02 * abs(power) * weight.sum())
+        single = order[rest[order] < sharp + _BROADER]
+        middle = _quantile(rest[single], weight[single], 0.5)
         best = min(best, (cost, float(power), float(middle)))
     return float(np.clip(math.exp(best[2]), *_WIDTHS)), best[1], mirrored
+
+
+def _quantile(values, weights, part):
+    """Weighted quantile of ordered values."""
+    sums = np.cumsum(weights)
+    return float(values[np.searchsorted(sums, part * sums[-1])])
 
 
 def _half_width(smooth, counts, top, step):
