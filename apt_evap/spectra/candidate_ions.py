@@ -3,6 +3,9 @@
 from collections.abc import Collection, Sequence
 from functools import lru_cache
 
+import numpy as np
+
+from apt_evap.specimen.nuclides import ISOTOPES
 from apt_evap.spectra.ion_names import GASES, HIGHEST_CHARGE, NOBLE, Ion, atoms_of_formula, element_of, formula_of_atoms
 
 # molecules of gases and adsorbed molecules that spectra of atom probes show
@@ -71,6 +74,45 @@ def molecular_ions(present: frozenset[str], minor: frozenset[str]) -> tuple[Ion,
             if "O" in present:
                 ions[Ion(formula_of_atoms(pair | {"O": 1}), 1)] = None
     return tuple(ions)
+
+
+def ions_between(low: float, high: float, present: Collection[str], own: str) -> list[Ion]:
+    """All ions whose most abundant isotopes have an m/n between bounds [Da], of any atoms that may be together.
+
+    Parameters
+    ----------
+    low, high : float
+        Bounds.
+    present : collection of str
+        Elements of molecules, beside those of gases.
+    own : str
+        An element whose ions are left out.
+    """
+    found = [ion for ion in atomic_ions([*HIGHEST_CHARGE]) if low < _main_mass(ion.formula) / ion.charge < high]
+    metals = sorted({*present} - {*GASES, "D", own})
+    cores = [{}, *({metal: number} for metal in metals for number in (1, 2, 3))]
+    cores += [{metal: 1, other: 1} for at, metal in enumerate(metals) for other in metals[at + 1 :]]
+    for core in cores:
+        mass = sum(_main_mass(name) * number for name, number in core.items())
+        for charge in (1, 2, 3) if core else (1, 2):
+            sums = (mass + _GAS_MASSES) / charge
+            for at in np.flatnonzero((sums > low) & (sums < high)):
+                gases = {name: int(number) for name, number in zip(GASES, _GAS_ATOMS[at], strict=True) if number}
+                if sum(gases.values()) <= (_MOST_LIGANDS if core else 2 * _MOST_LIGANDS) and (core or len(gases)):
+                    found.append(Ion(formula_of_atoms(core | gases), charge))
+    return [ion for ion in dict.fromkeys(found) if own not in ion.atoms]
+
+
+@lru_cache(1024)
+def _main_mass(symbol):
+    """Mass of the most abundant isotope [Da]."""
+    return max(("D" != symbol and ISOTOPES[element_of(symbol)]) or ((2.0141, 1.0),), key=lambda pair: pair[1])[0]
+
+
+# atoms of H, C, N and O that may be together, and their masses [Da]
+_MOST_LIGANDS = 4
+_GAS_ATOMS = np.array([(h, c, n, o) for h in range(9) for c in range(5) for n in range(4) for o in range(5)])
+_GAS_MASSES = _GAS_ATOMS @ np.array([_main_mass(name) for name in GASES])
 
 
 def expected_ions(formulas: Sequence[str]) -> list[Ion]:

@@ -1,5 +1,6 @@
 """Composition of a specimen in at.%, with errors of counting and the span over other names of the peaks."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -8,6 +9,7 @@ import numpy as np
 from apt_evap._common.types import Floats
 
 _LEAST_OF_OTHERS = 0.05  # at.%: less of an element that only other names have is not printed
+_LIKELY = 2.0  # chi-squared and costs by which the likelihood of another explanation falls by a factor of e
 MOST_UNEXPLAINED = 0.1
 """Part of the ions in peaks without an explanation, above which there is no composition."""
 
@@ -21,7 +23,7 @@ class Composition:
     at_percent : dict of str to float
         By element, the most frequent first [at.%]; empty if `refused`.
     error : dict of str to float
-        Standard errors of counting, with that of the shape of the peaks [at.%].
+        Standard errors of counting and of the shape of the peaks, and of other names by their likelihood [at.%].
     span : dict of str to tuple of float
         Lowest and highest value where peaks may have other names [at.%], also of elements that only these have; equal
         to the value if no peak has.
@@ -73,13 +75,13 @@ class Amounts:
     covariance : ndarray
         Of the numbers, shape (n, n).
     others : sequence
-        Atoms and numbers of ions of other explanations.
+        Other explanations: atoms and numbers of their ions, and by how much chi-squared and costs are above.
     """
 
     atoms: Sequence[Mapping[str, int]]
     ions: Floats
     covariance: Floats
-    others: Sequence[tuple[Sequence[Mapping[str, int]], Floats]] = field(default=())
+    others: Sequence[tuple[Sequence[Mapping[str, int]], Floats, float]] = field(default=())
 
     def composition(self, unexplained: float, refused: str = "") -> Composition:
         """Composition of these ions; none where too much is unexplained."""
@@ -98,13 +100,18 @@ class Amounts:
         error = np.sqrt(np.maximum(np.einsum("ei,ij,ej->e", slope, self.covariance, slope), 0))
         errors = dict(zip(share, error.tolist(), strict=True))
         span = {element: [value, value] for element, value in share.items()}
-        for atoms, ions in self.others:
-            other = _atoms_of(atoms, ions)
+        weights, spread = 1.0, dict.fromkeys(share, 0.0)
+        for atoms, ions, worse in self.others:
+            other, weight = _atoms_of(atoms, ions), math.exp(-max(worse, 0.0) / _LIKELY)
+            weights += weight
             every = sum(other.values())
             for element in {**span, **other} if every > 0 else ():
                 value = 100 * other.get(element, 0.0) / every
                 low, high = span.get(element, (0.0, 0.0))
                 span[element] = [min(low, value), max(high, value)]
+                if element in share:
+                    spread[element] += weight * (value - share[element]) ** 2
+        errors = {element: math.hypot(errors[element], math.sqrt(spread[element] / weights)) for element in share}
         order = sorted(share, key=lambda element: -share[element])
         return Composition(
             {element: share[element] for element in order},

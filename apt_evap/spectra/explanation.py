@@ -9,10 +9,10 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap.spectra.calibration_anchors import Point, find_anchors
-from apt_evap.spectra.candidate_ions import atomic_ions
+from apt_evap.spectra.candidate_ions import atomic_ions, ions_between
 from apt_evap.spectra.ion_choice import IonChoice
 from apt_evap.spectra.ion_fit import LIGHT, IonFit
-from apt_evap.spectra.ion_names import GASES, Abundances, Ion, atoms_of_formula, element_of
+from apt_evap.spectra.ion_names import COMMON, GASES, Abundances, Ion, atoms_of_formula, element_of
 from apt_evap.spectra.ion_profiles import IonProfiles
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import Contents, PeakContents
@@ -31,7 +31,8 @@ _MANY = 0.01  # of all ions: an element with such an ion is there
 _SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no other set is tried
 _ONE_LINE = 0.03  # of all ions, from which one line may show an element
 _KNOWN = 1e-3  # error of the calibration, below which it may
-_SPECIAL = ("D",)
+_LINES, _MOSTLY = 3, 0.3  # lines of all ions of an element, and their part of all ions, from which one of atoms is enough
+_ONE_LINE_ALONE, _KNOWN_ALONE = 0.002, 5e-4  # the same of a line that no other ion has, by a calibration without it
 
 
 @dataclass
@@ -46,8 +47,8 @@ class Explanation:
     covariance: Floats
     others: list[list[int]]
     """Ions that could be in place of each."""
-    sets: list[tuple[list[int], Floats]] = field(default_factory=list)
-    """Other sets of ions that explain the peaks about as well, with their amplitudes."""
+    sets: list[tuple[list[int], Floats, float]] = field(default_factory=list)
+    """Other sets of ions that explain the peaks about as well, their amplitudes, and chi-squared and costs above."""
     either: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Elements that could be in place of an element."""
     perhaps: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -121,7 +122,7 @@ class Explainer:
             self._learn(choice, chosen, amplitudes, number)
         sets, either = [], {}
         if self.allowed is None:
-            chosen, sets, either = self._other_sets(choice, chosen, amplitudes)
+            choice, chosen, sets, either = self._other_sets(choice, chosen, amplitudes)
         return self._finished(choice, chosen, sets, either, perhaps)
 
     def _choice(self, contents, window, shape_error=_SHAPE, own_shift=0.0):
@@ -180,19 +181,22 @@ class Explainer:
         return np.array(kept)
 
     def _hydrides(self, choice, chosen, amplitudes):
-        """Hydrides and nitrides with more ions than the atoms of the metal: they are other ions."""
+        """Hydrides, nitrides, and pairs with two charges, with more ions than the atoms of the metal: other ions."""
         atomic: dict[str, float] = defaultdict(float)
+        once: dict[str, float] = defaultdict(float)  # with one charge: of the m/n of a pair with two
         ions = [(choice.fit.ions[number], x) for number, x in zip(chosen, amplitudes, strict=True)]
         for ion, x in ions:
             if ion is not None and choice.atoms[choice.fit.numbers([ion])[0]].sum() == 1:
                 atomic[ion.formula] += x
+                once[ion.formula] += x * (ion.charge == 1)
         hydrides = set()
         for ion, x in ions:
             metals = [] if ion is None else [name for name in ion.atoms if name not in (*GASES, "D")]
-            if len(metals) != 1 or len(ion.atoms) != 2 or not {"H", "N"} & set(ion.atoms):
+            if len(metals) != 1 or ion.formula in self.expected:
                 continue
-            metal = metals[0]
-            if x > atomic[metal] and ion.formula not in self.expected:
+            metal, others = metals[0], set(ion.atoms) - {metals[0]}
+            pair = ion.atoms[metal] == ion.charge == 2 and others <= {"H", "D"}
+            if (pair and x > once[metal]) or (len(others) == 1 and others <= {"H", "N"} and x > atomic[metal]):
                 hydrides.add(ion)
         return hydrides
 
@@ -218,15 +222,53 @@ class Explainer:
         unsure = {}
         for at in np.flatnonzero(choice.atoms[np.asarray(chosen, int)].any(0)) if chosen else ():
             name = choice.elements[at]
-            if element_of(name) in GASES or len(lines[name]) > 1 or name in self._free:
+            if name == "H" or len(lines[name]) > 1 or name in self._free:
+                continue
+            # hydrogen and the gases have molecules, deuterium has one atomic line
+            if element_of(name) in (*GASES, "D") and len(self._lines_of(choice, chosen, amplitudes, name)) > 1:
                 continue
             place, ions = largest.get(name, (math.nan, 0.0))
-            known = ions > 0 and self.calibration.shift(place)[1][0] <= _KNOWN
-            if name in _SPECIAL and ions > 0 and len(self._lines_of(choice, chosen, amplitudes, name)) > 1:
-                continue  # deuterium has one atomic line: its molecules count
-            if ions < _ONE_LINE * contents.ions.sum() or not known:
-                unsure[name] = place, ions
+            held = self._lines_of(choice, chosen, amplitudes, name)
+            if ions > 0 and len(held) >= _LINES and contents.ions[sorted(held)].sum() > _MOSTLY * contents.ions.sum():
+                continue
+            part = ions / max(float(contents.ions.sum()), 1.0)
+            if ions > 0 and part >= _ONE_LINE and self.calibration.shift(place)[1][0] <= _KNOWN:
+                continue
+            if ions > 0 and part >= _ONE_LINE_ALONE and self._only(choice, chosen, amplitudes, name):
+                continue
+            unsure[name] = place, ions
         return unsure
+
+    def _only(self, choice, chosen, amplitudes, name):
+        """Whether no other ion can have the m/n of the line of an element, as the calibration by the others says.
+
+        Other ions are the atomic ones of all elements, and all molecules that the elements present may have.
+        """
+        fit = choice.fit
+        own = [n for n in chosen if fit.ions[n] is not None and choice.atoms[n, choice.elements.index(name)]]
+        if len(own) != 1 or name not in COMMON | {*GASES}:
+            return False
+        masses, shares = self.abundances.lines(fit.ions[own[0]].formula)
+        mass = float(masses[np.argmax(shares)]) / fit.ions[own[0]].charge
+        shift, error = (float(values[0]) for values in self._without(choice, own).shift(mass))
+        place = float(fit.contents.mass[fit.main[own[0]]])
+        error = math.hypot(error, float(fit.place_error[fit.main[own[0]]]))
+        if error > _KNOWN_ALONE or abs(place / mass - 1 - shift) > 3 * error:
+            return False
+        present = {choice.elements[at] for at in np.flatnonzero(choice.atoms[chosen].any(0))} - {name}
+        near = place / (1 + shift) * (1 - 3 * error), place / (1 + shift) * (1 + 3 * error)
+        tried = np.append(choice.candidates(chosen, amplitudes), choice.numbers(ions_between(*near, present, own=name)))
+        rivals = tried[(fit.main[tried] == fit.main[own[0]]) & fit.possible(tried)]
+        return set(rivals.tolist()) <= {own[0]}
+
+    def _without(self, choice, columns):
+        """The calibration without the points of some ions."""
+        ions = [choice.fit.ions[number] for number in columns]
+        masses = np.concatenate([self.abundances.lines(ion.formula)[0] / ion.charge for ion in ions])
+        calibration = MassCalibration()
+        calibration.learn([point for point in self.calibration.points if np.abs(masses - point[0]).min() > 1e-6])
+        calibration.scatter = self.calibration.scatter
+        return calibration
 
     def _lines_of(self, choice, chosen, amplitudes, name):
         """Peaks that the ions of an element explain for the most part."""
@@ -269,13 +311,14 @@ class Explainer:
         new.scatter = float(np.clip(1.48 * np.median(np.abs(rest)), 5e-5, 1e-3))
 
     def _other_sets(self, choice, chosen, amplitudes):
-        """Exchange all ions of an element against the best ions without it."""
-        fit, contents = choice.fit, choice.fit.contents
-        sets, either = [], {}
+        """Exchange all ions of an element against the best ions without it, by a calibration without it."""
+        sets: list[tuple[list[Ion], str, float]] = []
+        either = {}
         names = [choice.elements[at] for at in np.flatnonzero(choice.atoms[chosen].any(0))] if chosen else []
-        for name in sorted(set(names) - set(GASES)):
-            at = choice.elements.index(name)
-            if not choice.atoms[chosen][:, at].any():
+        for name in sorted(set(names) - {"H"}):
+            fit, contents, at = choice.fit, choice.fit.contents, choice.elements.index(name)
+            own = [number for number in chosen if choice.atoms[number, at]]
+            if not own:
                 continue
             amplitudes, _ = fit.solve(chosen)
             lines = sum(
@@ -283,25 +326,49 @@ class Explainer:
                 for number, x in zip(chosen, amplitudes, strict=True)
                 if choice.atoms[number, at] == choice.atoms[number].sum() == 1
             )
-            if lines > _SURE_LINES:
+            if lines > _SURE_LINES or name == "D":
                 continue
-            choice.banned = choice.banned | {name}
-            start = [number for number in chosen if not choice.atoms[number, at]]
-            others, other_amplitudes, _ = choice.choose(14, start)
-            choice.banned = choice.banned - {name}
-            without, before = choice.value(others), choice.value(chosen)
-            elements = [set(np.flatnonzero(choice.atoms[numbers].any(0)).tolist()) for numbers in (others, chosen)]
-            new = tuple(choice.elements[number] for number in sorted(elements[0] - elements[1]))
-            unnamed = [sum(fit.ions[number] is None for number in numbers) for numbers in (others, chosen)]
-            if without < before and not self._unsure(choice, others, other_amplitudes):
-                chosen = others
+            trial, start = self._independent(choice, chosen, own)
+            trial.banned = trial.banned | {name}
+            others, other_amplitudes, _ = trial.choose(14, [n for n in start if not trial.atoms[n, at]])
+            trial.banned = trial.banned - {name}
+            without, before = trial.value(others), trial.value(start)
+            elements = [set(np.flatnonzero(trial.atoms[numbers].any(0)).tolist()) for numbers in (others, start)]
+            new = tuple(trial.elements[number] for number in sorted(elements[0] - elements[1]))
+            unnamed = [sum(trial.fit.ions[number] is None for number in numbers) for numbers in (others, start)]
+            ions = [trial.fit.ions[n] for n in others]
+            if without < before and not self._unsure(trial, others, other_amplitudes):
+                if trial is not choice:
+                    self._anchors = [point for point in self._anchors if point in self._without(choice, own).points]
+                    self._learn(trial, others, other_amplitudes, 3)
+                    banned = choice.banned, choice.banned_ions
+                    choice = self._choice(contents, _WINDOWS[-1])
+                    choice.banned, choice.banned_ions = banned
+                chosen = [n if ion is None else choice.numbers([ion])[0] for n, ion in zip(others, ions, strict=True)]
             elif without < before + _ALIKE and unnamed[0] <= unnamed[1]:
-                sets.append(([n for n in others if fit.ions[n] is not None], name))
+                sets.append(([ion for ion in ions if ion is not None], name, without - before))
                 if new:
                     either[name] = new
         # only sets that exchange an element of the last choice
-        kept = [(others, name) for others, name in sets if choice.atoms[chosen][:, choice.elements.index(name)].any()]
-        return chosen, [[fit.ions[number] for number in others] for others, _ in kept], either
+        kept = [row for row in sets if choice.atoms[chosen][:, choice.elements.index(row[1])].any()]
+        names = {choice.elements[at] for at in np.flatnonzero(choice.atoms[chosen].any(0))} if chosen else set()
+        either = {name: new for name, new in either.items() if name in names}
+        return choice, chosen, [(ions, more) for ions, _, more in kept], either
+
+    def _independent(self, choice, chosen, own):
+        """The choice with a calibration without the points of some ions, if it changes, and the ions in it."""
+        known, fit = self.calibration, choice.fit
+        calibration = self._without(choice, own)
+        mass = fit.contents.mass[fit.main[own]]
+        (shift, error), (other, other_error) = known.shift(mass), calibration.shift(mass)
+        if (np.hypot(other_error - error, shift - other) < 0.5 * fit.place_error[fit.main[own]]).all():
+            return choice, chosen
+        self.calibration = calibration
+        trial = self._choice(fit.contents, _WINDOWS[-1])
+        self.calibration = known
+        trial.banned, trial.banned_ions = choice.banned, choice.banned_ions
+        ions = [fit.ions[number] for number in chosen]
+        return trial, [n if ion is None else int(trial.numbers([ion])[0]) for n, ion in zip(chosen, ions, strict=True)]
 
     def _finished(self, choice, chosen, sets, either, perhaps):
         """Ions with small shifts of their own, contents with the places of these ions only, errors, alternatives."""
@@ -338,11 +405,15 @@ class Explainer:
             for total, other, _, rest in choice.replacements(kept, number, tried, value + _ALIKE):
                 if total < value + _ALIKE:
                     others.append((total, other))
-                    explanation.sets.append(([*rest, other], self.amounts(fit, [*rest, other])[0]))
+                    explanation.sets.append(([*rest, other], self.amounts(fit, [*rest, other])[0], total - value))
             explanation.others.append([other for _, other in sorted(others)[:3]])
-        for others in sets:
+        for others, more in sets:
             numbers = choice.numbers(others).tolist()
-            explanation.sets.append((numbers, self.amounts(fit, numbers)[0]))
+            explanation.sets.append((numbers, self.amounts(fit, numbers)[0], more))
+        for total, more, rest in choice.other_elements(kept, amplitudes, value + _ALIKE):
+            explanation.sets.append(([*rest, *more], self.amounts(fit, [*rest, *more])[0], total - value))
+            for number, others in zip(kept, explanation.others, strict=True):
+                others += [other for other in more if fit.main[other] == fit.main[number] and other not in others]
         return explanation
 
     def _with_shifted(self, choice, chosen):

@@ -25,7 +25,6 @@ UNNAMED = 40.0
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
 _TRIED = 8  # best ions that are fitted in each step
 _FEWEST, _LEAST = 20.0, 1e-5  # ions of an ion, and over all ions
-_AT_ONCE = 120.0  # by which chi-squared and costs may rise with all ions of an element, before others are left out
 _SHARED = 0.3  # of the ions of an ion, in the main peak of another that it may replace
 
 
@@ -233,22 +232,40 @@ class IonChoice:
         return chosen, amplitudes, value
 
     def _with_elements(self, chosen, amplitudes, value):
-        """All atomic ions of one more element at once, while that is better without the ions that they displace."""
+        """All atomic ions of one more element at once, in place of those of their peaks, while that is better."""
+        best = min(self.other_elements(chosen, amplitudes, value - 1e-6), default=None)
+        if best is None:
+            return chosen, amplitudes, value, False
+        _, more, rest = best
+        trial, chi2 = self.fit.solve([*rest, *more])
+        return *self.pruned([*rest, *more], trial, chi2 + self.cost([*rest, *more])), True
+
+    def other_elements(
+        self, chosen: Sequence[int], amplitudes: Floats, limit: float
+    ) -> Iterator[tuple[float, list[int], list[int]]]:
+        """Absent elements whose atomic ions could be in place of others: chi-squared with costs, their ions, the rest.
+
+        Only those with two or more ions, whose chi-squared and costs are below a limit.
+        """
         present, _ = self._present(np.asarray(chosen, int))
         tried = self.candidates(chosen, amplitudes)
-        atomic, changed = self._atomic[tried], False
+        atomic = self._atomic[tried]
         for at in np.unique(atomic[atomic >= 0]):
             more = tried[atomic == at].tolist()
             if present[at] or len(more) < 2:
                 continue
-            trial, chi2 = self.fit.solve([*chosen, *more])
-            if chi2 + self.cost([*chosen, *more]) > value + _AT_ONCE:
+            peaks = set(self.fit.main[more].tolist())
+            rest = [number for number in chosen if int(self.fit.main[number]) not in peaks]
+            if len(rest) == len(chosen):
                 continue
-            every = [*chosen, *more]
-            every, trial, total = self.pruned(every, trial, chi2 + self.cost(every))
-            if total < value - 1e-6 and (trial >= self.least).all():
-                chosen, amplitudes, value, changed = every, trial, total, True
-        return chosen, amplitudes, value, changed
+            trial, chi2 = self.fit.solve([*rest, *more])
+            held = trial[len(rest) :] >= self.least
+            if not held.all() and held.sum() > 1:
+                more = [number for number, enough in zip(more, held, strict=True) if enough]
+                trial, chi2 = self.fit.solve([*rest, *more])
+            total = chi2 + self.cost([*rest, *more])
+            if total < limit and (trial[len(rest) :] >= self.least).all():
+                yield total, more, rest
 
     def pruned(self, chosen: list[int], amplitudes: Floats, value: float) -> tuple[list[int], Floats, float]:
         """Without ions that cost more than they explain."""

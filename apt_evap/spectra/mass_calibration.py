@@ -17,16 +17,20 @@ class MassCalibration:
 
     Attributes
     ----------
+    points : list of tuple
+        What it learnt: m/n [Da], relative error, and its standard deviation.
     scatter : float
         Relative scatter of the peaks about the curve.
     """
 
     def __init__(self) -> None:
         self._logs = np.zeros(0)
+        self.points: list[tuple[float, float, float]] = []
         self.scatter = 1e-4
 
     def learn(self, points: Sequence[tuple[float, float, float]]) -> None:
         """Learn from m/n [Da], relative errors and their standard deviations."""
+        self.points = list(points)
         if not len(points):
             self._logs = np.zeros(0)
             return

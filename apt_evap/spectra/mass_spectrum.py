@@ -344,7 +344,10 @@ class _Named:
             [ion.atoms for ion in ions],
             explanation.amplitudes,
             explanation.covariance,
-            [([fit.ions[n].atoms for n in numbers], x) for numbers, x in explanation.sets],  # type: ignore[union-attr]
+            [
+                ([fit.ions[n].atoms for n in numbers], x, worse)  # type: ignore[union-attr]
+                for numbers, x, worse in explanation.sets
+            ],
         )
         rest = contents.ions - fit.explained(explanation.chosen, explanation.amplitudes)
         large = contents.seen & (rest > np.maximum(_UNLIKE * contents.ions, _FEWEST))
