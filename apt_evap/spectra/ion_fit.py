@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from apt_evap._common.types import Booleans, Floats
 from apt_evap.spectra.ion_names import Abundances, Ion
 from apt_evap.spectra.mass_calibration import MassCalibration
-from apt_evap.spectra.peak_contents import Contents
+from apt_evap.spectra.peak_contents import CORE, Contents
 from apt_evap.spectra.peak_scale import PeakScale
 
 LIGHT = 3.3
@@ -31,6 +31,7 @@ class IonFit:
 
     The number of ions in a peak k is the sum of the amplitudes of its ions times the abundances of their isotopes. The
     centre of gravity of the places where these should be is the place of the peak. Both are linear in the amplitudes.
+    Isotopes where no peak is count against an ion.
     The first n ions are peaks without a name, one for each of the n peaks.
 
     Parameters
@@ -86,6 +87,7 @@ class IonFit:
         self._rows = np.hstack([np.diag(1 / self.error), np.zeros((self.number, self.number))])
         self._products: dict[int, Floats] = {}
         self._refresh()
+        self._absent = np.zeros(self.number)
         self.missed, self.main, self.largest = np.zeros(self.number), np.arange(self.number), np.ones(self.number)
         self.shares = np.eye(self.number)
         """Share of the ions of each column in each peak, shape (columns, n)."""
@@ -111,7 +113,7 @@ class IonFit:
         )
         share = np.concatenate([shares for _, shares in lines])
         contents, shifts = np.zeros((len(new), n)), np.zeros((len(new), n))
-        missed = np.bincount(owner, share, minlength=len(new))
+        missed, absent = np.bincount(owner, share, minlength=len(new)), np.zeros(len(new))
         if n:
             near = np.searchsorted(mass, places)[:, None] + np.arange(-2, 2)
             inside = (near >= 0) & (near < n)
@@ -137,6 +139,8 @@ class IonFit:
             joined = ~held & own[owner] & (seen_distance[line, nearest] < _JOINED * self.scale.sigma(places))
             np.add.at(contents, (owner[joined], near[line, nearest][joined]), share[joined])
             missed = np.bincount(owner, share * ~(held | joined), minlength=len(new))
+            none = ~(held | joined)
+            absent = np.bincount(owner[none], (share / self._noise(places))[none] ** 2, minlength=len(new))
         rows = np.hstack([contents / self.error, shifts / (np.maximum(self.contents.ions, 1) * self.place_error)])
         first = len(self.ions)
         self.ions += new
@@ -147,11 +151,19 @@ class IonFit:
         self._rows = np.vstack([self._rows, rows])
         self.shares = np.vstack([self.shares, contents])
         self.missed = np.concatenate([self.missed, missed])
+        self._absent = np.concatenate([self._absent, absent])
         main = np.argmax(contents, axis=1) if n else np.zeros(len(new), int)
         self.main = np.concatenate([self.main, main])
         self.largest = np.concatenate([self.largest, contents.max(axis=1, initial=0)])
-        self._diagonal = np.concatenate([self._diagonal, np.einsum("ij,ij->i", rows, rows)])
+        self._diagonal = np.concatenate([self._diagonal, np.einsum("ij,ij->i", rows, rows) + absent])
         self._projections = np.concatenate([self._projections, rows[:, :n] @ self._target])
+
+    def _noise(self, places):
+        """Standard deviation of the content of places without a peak [Da]: of counting, and what may be there."""
+        bins = np.clip(np.rint(self.scale.bins(places)), 0, self.scale.size - 1).astype(int)
+        counts = self.contents.around[bins]
+        more = np.maximum(counts - self.contents.background[bins] * (2 * CORE + 1), 0)
+        return np.sqrt(counts + 4 + more**2)
 
     def possible(self, numbers: Rows) -> Booleans:
         """Whether ions have most of their isotopes in the spectrum, and a peak for the most abundant one."""
@@ -164,6 +176,7 @@ class IonFit:
         """Products of a column with all others."""
         if number not in self._products:
             self._products[number] = self._rows @ self._rows[number]
+            self._products[number][number] += self._absent[number]
         return self._products[number]
 
     def products(self, numbers: Rows, chosen: Sequence[int]) -> Floats:

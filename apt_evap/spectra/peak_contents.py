@@ -36,6 +36,8 @@ class Contents(NamedTuple):
     """Background in each bin of the scale."""
     shapes: Floats
     """Shape of each peak, shape (n, bins)."""
+    around: Floats
+    """Counts about each bin, as far as the core of a peak goes."""
 
     @property
     def total(self) -> float:
@@ -89,7 +91,8 @@ class PeakContents:
                 mixture /= mixture.sum()
         self._mixture = mixture
         shapes = np.where(strong[:, None], shares, mixture) @ self._bases
-        return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes)
+        return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes,
+                        np.convolve(self.counts, np.ones(2 * CORE + 1), "same"))  # fmt: skip
 
     def _maximise(self, place, height, strong, mixture, iterations):
         """Ions and shares of the tails of each peak, and the background, by expectation and maximisation."""
