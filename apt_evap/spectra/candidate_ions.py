@@ -84,19 +84,20 @@ def ions_between(low: float, high: float, present: Collection[str], own: str) ->
     low, high : float
         Bounds.
     present : collection of str
-        Elements of molecules, beside those of gases.
+        Elements of molecules, beside hydrogen.
     own : str
         An element whose ions are left out.
     """
     found = [ion for ion in atomic_ions([*HIGHEST_CHARGE]) if low < _main_mass(ion.formula) / ion.charge < high]
     metals = sorted({*present} - {*GASES, "D", own})
+    allowed = ~(_GAS_ATOMS[:, [name not in {"H", *present} for name in GASES]] > 0).any(1)
     cores = [{}, *({metal: number} for metal in metals for number in (1, 2, 3))]
     cores += [{metal: 1, other: 1} for at, metal in enumerate(metals) for other in metals[at + 1 :]]
     for core in cores:
         mass = sum(_main_mass(name) * number for name, number in core.items())
-        for charge in (1, 2, 3) if core else (1, 2):
+        for charge in (1, 2) if core else (1,):
             sums = (mass + _GAS_MASSES) / charge
-            for at in np.flatnonzero((sums > low) & (sums < high)):
+            for at in np.flatnonzero((sums > low) & (sums < high) & allowed):
                 gases = {name: int(number) for name, number in zip(GASES, _GAS_ATOMS[at], strict=True) if number}
                 if sum(gases.values()) <= (_MOST_LIGANDS if core else 2 * _MOST_LIGANDS) and (core or len(gases)):
                     found.append(Ion(formula_of_atoms(core | gases), charge))

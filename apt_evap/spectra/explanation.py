@@ -32,7 +32,7 @@ _SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no ot
 _ONE_LINE = 0.03  # of all ions, from which one line may show an element
 _KNOWN = 1e-3  # error of the calibration, below which it may
 _LINES, _MOSTLY = 3, 0.3  # lines of all ions of an element, and their part of all ions, from which one of atoms is enough
-_ONE_LINE_ALONE, _KNOWN_ALONE = 0.002, 5e-4  # the same of a line that no other ion has, by a calibration without it
+_ONE_LINE_ALONE = 0.002  # the same of a line that no other ion has, by a calibration without it
 
 
 @dataclass
@@ -83,6 +83,7 @@ class Explainer:
         self.allowed = self._free if only else None
         self.calibration = MassCalibration()
         self._anchors: list[Point] = []
+        self._alone: set[str] = set()  # elements of lines that no other ion can have
 
     def explain(self) -> Explanation:
         """The ions, in four rounds: with each the calibration is better known."""
@@ -114,6 +115,7 @@ class Explainer:
                 if hydrides := self._hydrides(choice, chosen, amplitudes):
                     banned_ions |= hydrides
                     continue
+                chosen, amplitudes = self._with_lone(choice, chosen, amplitudes)
                 unsure = self._unsure(choice, chosen, amplitudes)
                 if not unsure:
                     break
@@ -239,6 +241,26 @@ class Explainer:
             unsure[name] = place, ions
         return unsure
 
+    def _with_lone(self, choice, chosen, amplitudes):
+        """Atomic ions of peaks without a name that no other ion can have."""
+        if self.allowed is not None:
+            return chosen, amplitudes
+        fit, contents = choice.fit, choice.fit.contents
+        tried = choice.candidates(chosen, amplitudes)
+        tried = [n for n in tried.tolist() if choice.atoms[n].sum() == 1 and fit.ions[n].formula not in GASES]
+        for peak in [n for n in chosen if fit.ions[n] is None and contents.ions[n] > _ONE_LINE_ALONE * contents.total]:
+            ions = [number for number in tried if fit.main[number] == peak]
+            rest = [number for number in chosen if number != peak]
+            for number in ions:
+                name = fit.ions[number].formula
+                trial, chi2 = fit.solve([*rest, number])
+                above = chi2 + choice.cost([*rest, number]) - fit.solve(chosen)[1] - choice.cost(chosen)
+                if above < _ALIKE and self._only(choice, [*rest, number], trial, name):
+                    chosen, amplitudes = [*rest, number], trial
+                    self._alone.add(name)
+                    break
+        return chosen, amplitudes
+
     def _only(self, choice, chosen, amplitudes, name):
         """Whether no other ion can have the m/n of the line of an element, as the calibration by the others says.
 
@@ -253,7 +275,7 @@ class Explainer:
         shift, error = (float(values[0]) for values in self._without(choice, own).shift(mass))
         place = float(fit.contents.mass[fit.main[own[0]]])
         error = math.hypot(error, float(fit.place_error[fit.main[own[0]]]))
-        if error > _KNOWN_ALONE or abs(place / mass - 1 - shift) > 3 * error:
+        if error > _KNOWN or abs(place / mass - 1 - shift) > 3 * error:
             return False
         present = {choice.elements[at] for at in np.flatnonzero(choice.atoms[chosen].any(0))} - {name}
         near = place / (1 + shift) * (1 - 3 * error), place / (1 + shift) * (1 + 3 * error)
@@ -326,7 +348,7 @@ class Explainer:
                 for number, x in zip(chosen, amplitudes, strict=True)
                 if choice.atoms[number, at] == choice.atoms[number].sum() == 1
             )
-            if lines > _SURE_LINES or name == "D":
+            if lines > _SURE_LINES or name == "D" or name in self._alone:
                 continue
             trial, start = self._independent(choice, chosen, own)
             trial.banned = trial.banned | {name}

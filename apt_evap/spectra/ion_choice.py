@@ -240,19 +240,33 @@ class IonChoice:
         trial, chi2 = self.fit.solve([*rest, *more])
         return *self.pruned([*rest, *more], trial, chi2 + self.cost([*rest, *more])), True
 
+    def _gas_molecules(self, element):
+        """Ions of one atom of an element and those of gases."""
+        gases = set(GASES) if self.allowed is None else set(GASES) & set(self.elements)
+        ions = molecular_ions(frozenset(gases - self.banned | {element}), frozenset())
+        ions = [ion for ion in ions if ion.atoms.get(element) == 1 and ion not in self.banned_ions]
+        numbers = self.numbers(ions) if ions else np.zeros(0, np.int64)
+        return numbers[self.fit.possible(numbers)]
+
     def other_elements(
         self, chosen: Sequence[int], amplitudes: Floats, limit: float
     ) -> Iterator[tuple[float, list[int], list[int]]]:
         """Absent elements whose atomic ions could be in place of others: chi-squared with costs, their ions, the rest.
 
-        Only those with two or more ions, whose chi-squared and costs are below a limit.
+        Only those with two or more ions, with the molecules that fit peaks without a name, whose chi-squared and costs are below a limit.
         """
         present, _ = self._present(np.asarray(chosen, int))
         tried = self.candidates(chosen, amplitudes)
         atomic = self._atomic[tried]
+        unnamed = [number for number in chosen if number < self.fit.number]
         for at in np.unique(atomic[atomic >= 0]):
             more = tried[atomic == at].tolist()
-            if present[at] or len(more) < 2:
+            if present[at]:
+                continue
+            if unnamed and set(self.fit.main[more].tolist()) & set(unnamed):
+                molecules = self._gas_molecules(self.elements[at])
+                more += molecules[np.isin(self.fit.main[molecules], unnamed)].tolist()
+            if len(more) < 2:
                 continue
             peaks = set(self.fit.main[more].tolist())
             rest = [number for number in chosen if int(self.fit.main[number]) not in peaks]
