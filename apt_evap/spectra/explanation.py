@@ -30,8 +30,9 @@ _MOST_POINTS = 60
 _MANY = 0.01  # of all ions: an element with such an ion is there
 _SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no other set is tried
 _ONE_LINE = 0.03  # of all ions, from which one line may show an element
+_ONE_ISOTOPE = 0.8  # abundance of the isotope of such an element
 _KNOWN = 1e-3  # error of the calibration, below which it may
-_LINES, _MOSTLY = 3, 0.3  # lines of all ions of an element, and their part of all ions, from which one of atoms is enough
+_LINES, _MOSTLY = 3, 0.3  # lines of all ions of an element, and their part of all ions: one of atoms is enough
 _ONE_LINE_ALONE = 0.002  # the same of a line that no other ion has, by a calibration without it
 
 
@@ -215,7 +216,7 @@ class Explainer:
             if ion is None or choice.atoms[number].sum() > 1:
                 continue
             held = fit.shares[number] * x
-            clear = contents.seen & (held > 5 * np.sqrt(contents.variance))
+            clear = contents.seen & (held > 4 * np.sqrt(contents.variance))
             clear &= held > 0.5 * np.maximum(total, contents.ions)
             lines[ion.formula] |= set(np.flatnonzero(clear).tolist())
             peak = int(np.argmax(held))
@@ -234,7 +235,8 @@ class Explainer:
             if ions > 0 and len(held) >= _LINES and contents.ions[sorted(held)].sum() > _MOSTLY * contents.ions.sum():
                 continue
             part = ions / max(float(contents.ions.sum()), 1.0)
-            if ions > 0 and part >= _ONE_LINE and self.calibration.shift(place)[1][0] <= _KNOWN:
+            alone = self.abundances.lines(name)[1].max() > _ONE_ISOTOPE  # else the other isotopes should be seen
+            if ions > 0 and alone and part >= _ONE_LINE and self.calibration.shift(place)[1][0] <= _KNOWN:
                 continue
             if ions > 0 and part >= _ONE_LINE_ALONE and self._only(choice, chosen, amplitudes, name):
                 continue

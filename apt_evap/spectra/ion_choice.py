@@ -253,7 +253,8 @@ class IonChoice:
     ) -> Iterator[tuple[float, list[int], list[int]]]:
         """Absent elements whose atomic ions could be in place of others: chi-squared with costs, their ions, the rest.
 
-        Only those with two or more ions, with the molecules that fit peaks without a name, whose chi-squared and costs are below a limit.
+        Only those with two or more ions, with the molecules that fit peaks without a name, and chi-squared with costs
+        below a limit.
         """
         present, _ = self._present(np.asarray(chosen, int))
         tried = self.candidates(chosen, amplitudes)
