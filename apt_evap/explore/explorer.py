@@ -228,6 +228,8 @@ class Explorer:
         self.registration = registration
         self.crystal = ""
         """Name of the crystal of the measurement, if it is known and one of the table."""
+        self.crystal_of_ions = ""
+        """Element of most of the measured ions by their masses, if the spectrum has named them."""
         self.registration_options: dict[str, Any] = {}
         """Options of `register` that say where the run is on the measurement."""
         self._indexed_start: dict[str, Any] | None = None  # the same by an indexing of these ions; {} if undecided
@@ -316,7 +318,7 @@ class Explorer:
     def register(
         self,
         perturbations: Sequence[Perturbation] | None = None,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[float, int], None] | None = None,
         apply: Callable[..., Registration] | None = None,
     ) -> Registration:
         """Register the run on the measurement: the best of several emissions. Returns `registration`.
@@ -328,7 +330,8 @@ class Explorer:
         perturbations : sequence of perturbation, optional
             Emissions to try; by default one of each mechanism.
         progress : callable, optional
-            Called at the start and after each emission, with the number of those that are done, and of all. An error
+            Called at the start and after each emission, with the number of those that are done, and of all. The
+            indexing of the measured map is the first of them if it is not known yet, and is told in parts. An error
             that it raises ends the search.
         apply : callable, optional
             Calls a function with a tuple of arguments, such as `SearchProcess.call`.
@@ -352,20 +355,22 @@ class Explorer:
         target = measured_map(self.measured)
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
-        call = apply or (lambda function, arguments: function(*arguments))
+        call = apply or (lambda function, arguments, options={}, progress=None: function(*arguments, **options))
         best: Registration | None = None
         registration: Registration | None
         failed = ValueError("perturbations must contain at least one perturbation, got none")
         progress = progress or (lambda done, number: None)
-        progress(0, len(perturbations))
-        options = self._start(target, call)
-        for done, perturbation in enumerate(perturbations, 1):
+        indexes = not self.registration_options and self._indexed_start is None
+        number = len(perturbations) + indexes
+        progress(0, number)
+        options = self._start(target, call, lambda part: progress(part, number))
+        for done, perturbation in enumerate(perturbations, 1 + indexes):
             arguments = self.run.hits(perturbation), target, options
             try:
                 registration = call(_registration, arguments)
             except ValueError as error:  # such as a map that is too empty with this emission
                 registration, failed = None, error
-            progress(done, len(perturbations))
+            progress(done, number)
             if registration is not None and (best is None or registration.score > best.score):
                 best = registration
                 if not best.doubtful:
@@ -376,13 +381,14 @@ class Explorer:
         best.warn_if_doubtful()
         return best
 
-    def _start(self, target, call):
+    def _start(self, target, call, progress):
         """Options that say where the run is: given ones, or by an indexing of the measured map, once for its ions."""
         if self.registration_options:
             return self.registration_options
         if (start := self._indexed_start) is None:
             start = {}
-            indexing = call(index_as_run, (target, Orientation.known(self.run.settings["tip"]), self.distance))
+            arguments = target, Orientation.known(self.run.settings["tip"]), self.distance
+            indexing = call(index_as_run, arguments, {}, progress)
             if indexing is not None and indexing.decided:
                 with suppress(ValueError):  # the axis of the run is not on the map
                     start = indexed_start(self.run, indexing)

@@ -2,6 +2,7 @@
 
 import cmath
 import math
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,7 +32,7 @@ from apt_evap.explore.mouse_tools import MouseTool
 from apt_evap.explore.newest_task import NewestTaskRunner
 from apt_evap.explore.pole_panel import draw_poles, sparse_labels, with_gaps
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
-from apt_evap.explore.widgets import LEFT
+from apt_evap.explore.widgets import LEFT, progress_text
 from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.start_settings import StartSettings, settings_of
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -100,6 +101,7 @@ class IndexPanel:
         self._tasks = NewestTaskRunner()
         self.candidates: list[tuple[Orientation, Projection, str]] = []
         self._indexing: Indexing | None = None  # of the search that gave the candidates
+        self._process: SearchProcess | None = None
         self._awaited: Any = None  # the fit or search whose candidates will be shown, unless others come first
         self._make_widgets(self._kept.get("material") or material)
         self._make_drawings(figures[-1])
@@ -122,7 +124,8 @@ class IndexPanel:
                 self._put([], _OTHER_IONS)
 
     def close(self) -> None:
-        """End the fits."""
+        """End the fits and the search."""
+        self._cancel()
         self._tasks.close()
 
     def _make_widgets(self, material):
@@ -142,6 +145,8 @@ class IndexPanel:
         self.search.on_click(lambda: self._search(self.search))
         self.refine = Button(label="fit from here", width=100, visible=False)
         self.refine.on_click(lambda: self._search(self.refine, self.candidates[int(self.choice.value or 0)][:2]))
+        self.cancel = Button(label="cancel", width=LEFT - 10, visible=False)
+        self.cancel.on_click(self._cancel)
         self.choice = Select(title="candidates", options=[], width=LEFT - 10, visible=False)
         self.text = Div(text=HINT, width=LEFT - 10, styles={"color": "var(--faint)"})
         self.material.on_change("value", lambda attr, old, new: self._material_changed())
@@ -156,6 +161,7 @@ class IndexPanel:
             row(self.material, self.family),
             row(self.undo, self.new_line, self.clear, self.search),
             self.text,
+            self.cancel,
             self.choice,
             self.refine,
             row(self.scale, self.options),
@@ -306,14 +312,25 @@ class IndexPanel:
         label = button.label
         for search_button in (self.search, self.refine):
             search_button.disabled = True
-        button.label = "searching" if start is None else "fitting"
+        button.label = doing = "searching" if start is None else "fitting"
+        self.cancel.visible = True
+        began = time.monotonic()
 
         self._awaited = inputs = arguments, options
+        self.text.text = progress_text(0, 0, doing)
+
+        def progress(part):
+            self._later(partial(told, part, time.monotonic() - began), 0)
+
+        def told(part, seconds):
+            if self._awaited is inputs:
+                self.text.text = progress_text(part, seconds, doing)
 
         def put(indexing, text):
             for search_button in (self.search, self.refine):
                 search_button.disabled = False
             button.label = label
+            self.cancel.visible, self._process = False, None
             if self._awaited is inputs:  # no mark, fit or handle has changed
                 self._put_searched(indexing, text)
             after, self._after_search = self._after_search, None
@@ -322,10 +339,16 @@ class IndexPanel:
 
         def work():
             with SearchProcess() as process:
-                indexing = process.call(index, arguments, options)
+                self._process = process
+                indexing = process.call(index, arguments, options, progress)
             self._later(partial(put, indexing, f"{indexing.verdict}: {indexing.reason}"), 0)
 
         start_thread(work, lambda sentence: self._later(partial(put, None, sentence), 0))
+
+    def _cancel(self):
+        """End a search, of which the page is then told."""
+        if self._process is not None:
+            self._process.end()
 
     def _put_searched(self, indexing, text):
         rows = [] if indexing is None else [

@@ -11,6 +11,7 @@ from bokeh.layouts import column, row
 from bokeh.models import Button, CustomJS, GlobalInlineStyleSheet, Widget
 
 from apt_evap.explore.code_panel import CodePanel
+from apt_evap.explore.correlation_panel import CorrelationPanel
 from apt_evap.explore.display_panel import DisplayPanel
 from apt_evap.explore.dropped_file import DROP, TOLD
 from apt_evap.explore.emission_panel import EmissionPanel
@@ -135,6 +136,7 @@ class Page:
             tools = {"atoms": self.specimen.tool} | tools
             self._panels += [self.specimen, self.rings, self.poles]
         self.spectrum: SpectrumPanel | None = None
+        self.correlation: CorrelationPanel | None = None
         if explorer.measured is not None:
             self.index = IndexPanel(
                 figures, lambda: explorer.measured, self._material(), self._later, self.code.put_python,
@@ -147,8 +149,10 @@ class Page:
             tools |= self.index.tools
             if isinstance(explorer.ions_of_file, MeasuredIons):
                 self.spectrum = SpectrumPanel(
-                    explorer.ions_of_file, explorer.names[1], self._ions_selected, self.index.propose, self._later
+                    explorer.ions_of_file, explorer.names[1], self._ions_selected, self._element_named, self._later
                 )
+                self.correlation = CorrelationPanel(explorer.ions_of_file, self._later)
+                self.spectrum.shown.append(self.correlation.put)
         if explorer.is_comparison:
             emission = self.emission
             self.registration = RegistrationPanel(
@@ -166,6 +170,12 @@ class Page:
         self.index.ions_changed()
         self.summary.put_facts()
         self.request(False)
+
+    def _element_named(self, name):
+        """Propose the element of most ions as the crystal, and name it beside a verdict."""
+        self.explorer.crystal_of_ions = name
+        self.index.propose(name)
+        self.summary.put_verdict()
 
     def _show_candidate(self):
         """Poles of the candidate while the map is indexed, else those of the run."""
@@ -215,12 +225,21 @@ class Page:
         contents: dict[str, Any] = {} if self.specimen is None else {"specimen": self.specimen.widgets}
         if self.spectrum is not None:
             contents["spectrum"] = self.spectrum.widgets
+        if self.correlation is not None and self.correlation.has_pulses:
+            contents["correlation"] = self.correlation.widgets
         contents |= {"profile": self.profile.widgets, "code": self.code.widgets}
         tools = [self.tools.row] if self.poles is None else [self.tools.row, self.poles.button]
         self.tabs = Tabs(contents)
         verdict = []
         if self.registration is not None:
-            verdict = [row(self.registration.status, self.summary.readout, sizing_mode="stretch_width")]
+            verdict = [
+                row(
+                    self.registration.status,
+                    self.registration.cancel,
+                    self.summary.readout,
+                    sizing_mode="stretch_width",
+                )
+            ]
         elif self.explorer.run is not None:
             verdict = [self.summary.readout]
         return column(

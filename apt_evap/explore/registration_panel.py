@@ -12,7 +12,7 @@ from bokeh.models import Button, Div, TextInput
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.explore.search_process import SearchProcess, start_thread
-from apt_evap.explore.widgets import LEFT
+from apt_evap.explore.widgets import LEFT, progress_text
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.registration.verdict import Likeness
 
@@ -38,12 +38,13 @@ class RegistrationPanel:
         self._request, self._note, self._later, self._judged = request, note, later, judged
         self._process: SearchProcess | None = None
         self._number = 0  # of the search whose result is awaited
-        self._progress: tuple[int, int] | None = None
-        self._progress_text = ""
+        self._progress: tuple[float, float] | None = None  # part that is done, and seconds
         self._maps: ExplorerMaps | None = None
         self.likeness: Any = None
         """The last verdict."""
         self.status = Div()
+        self.cancel = Button(label="cancel", width=70, visible=False)
+        self.cancel.on_click(self._cancelled)
         half = (LEFT - 20) // 2
         one = Button(label="with this emission", width=half)
         one.on_click(lambda: self.search([perturbation()]))
@@ -98,10 +99,13 @@ class RegistrationPanel:
     def _put_progress(self, number, start, done, of):
         if number != self._number:  # another one has begun
             return
-        self._progress, self._progress_text = (done, of), "half a minute each"
-        if done:
-            self._progress_text = f"about {(time.monotonic() - start) / done * (of - done):.0f} s left"
+        self._progress = done / of, time.monotonic() - start
+        if done >= 1:
             self._request(False)  # the best so far
+        self._put_status()
+
+    def _cancelled(self):
+        self.close()
         self._put_status()
 
     def _ended(self, number, sentence=""):
@@ -147,11 +151,8 @@ class RegistrationPanel:
         """Show the state of the search."""
         parts = []
         if self._progress is not None:
-            done, of = self._progress
-            parts.append(
-                f'<progress value="{done}" max="{of}" style="width: 120px"></progress> '
-                f"<small>registering, {self._progress_text}</small>"
-            )
+            parts.append(progress_text(*self._progress, "registering"))
         elif not self._explorer.registered:
             parts.append("<small>not registered</small>")
         self.status.text = " ".join(parts)
+        self.cancel.visible = self._progress is not None

@@ -8,6 +8,7 @@ from typing import Any
 from bokeh.models import Button, Div
 
 from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.explore.widgets import duration
 
 INTERVAL = 500
 """Time between two updates of the state of the run [ms]."""
@@ -71,7 +72,7 @@ class RunProgress:
         for button, label in self._buttons.items():
             button.update(label="stop the run" if active else label, visible=active or bool(label))
         if active:
-            left = "" if run.seconds_left is None else f", {_duration(run.seconds_left)} left"
+            left = "" if run.seconds_left is None else f", {duration(run.seconds_left)} left"
             state = run.message or f"{run.ions:,} of {run.n_ions:,} ions{left}"
             self._text.text = (
                 f'<progress value="{run.ions}" max="{run.n_ions or 1}" style="width: 100%"></progress><br>'
@@ -85,7 +86,3 @@ class RunProgress:
             self._text.text = escape(f"{run.output} has all ions: apt-evap explore {run.output}")
             if self._open_run is not None:
                 self._open_run(str(run.output))
-
-
-def _duration(seconds):
-    return f"{seconds / 60:.0f} min" if seconds > 100 else f"{seconds:.0f} s"

@@ -24,6 +24,7 @@ class SearchProcess:
         self._process = context.Process(target=_serve, args=(pipe,), daemon=True)
         self._process.start()
         pipe.close()  # the pipe then ends with the process
+        self._cancelled = False
 
     def __enter__(self) -> "SearchProcess":
         return self
@@ -33,15 +34,28 @@ class SearchProcess:
 
     def end(self) -> None:
         """End the process; a call in another thread then raises a `ProcessEnded`."""
+        self._cancelled = True
         self._process.terminate()
 
-    def call(self, function: Callable[..., Any], arguments: Sequence[Any], options: Mapping[str, Any] = {}) -> Any:
-        """Call a function there."""
+    def call(
+        self,
+        function: Callable[..., Any],
+        arguments: Sequence[Any],
+        options: Mapping[str, Any] = {},
+        progress: Callable[[float], None] | None = None,
+    ) -> Any:
+        """Call a function there; with `progress`, it has an argument of this name, whose calls come here."""
         try:
-            self._pipe.send((function, arguments, dict(options)))
-            result, sentence = self._pipe.recv()
+            self._pipe.send((function, arguments, dict(options), progress is not None))
+            while True:
+                part, result, sentence = self._pipe.recv()
+                if part is None:
+                    break
+                if progress is not None:
+                    progress(part)
         except (EOFError, OSError):
-            raise ProcessEnded("the process of the search was killed, perhaps for want of memory") from None
+            killed = "the process of the search was killed, perhaps for want of memory"
+            raise ProcessEnded("the search was cancelled" if self._cancelled else killed) from None
         if sentence:
             raise ValueError(sentence)
         return result
@@ -52,11 +66,13 @@ def _serve(pipe):
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the explorer, which then ends this process
     with contextlib.suppress(EOFError, OSError):
         while True:
-            function, arguments, options = pipe.recv()
+            function, arguments, options, tells = pipe.recv()
+            if tells:
+                options["progress"] = lambda part: pipe.send((part, None, ""))
             try:
-                reply = function(*arguments, **options), ""
+                reply = None, function(*arguments, **options), ""
             except Exception as error:
-                reply = None, sentence_of(error)
+                reply = None, None, sentence_of(error)
             pipe.send(reply)
 
 

@@ -12,10 +12,11 @@ from bokeh.server.server import Server
 from bokeh.util.token import generate_session_id
 
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
+from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import remember_file
 from apt_evap.explore.run_progress import ServerState
-from apt_evap.explore.start_page import EXAMPLE, write_example
+from apt_evap.explore.start_page import EXAMPLE, RANGES, measurement_of, write_example
 from apt_evap.explore.upload import UploadHandler
 from apt_evap.maps.registration.register import Registration
 
@@ -81,10 +82,15 @@ def serve(
         assert with_file is not None
         if path == EXAMPLE:
             write_example()
-        before, shown = shown[0], with_file(path)
-        remember_file(path)
-        if before is not None and shown[0] is not None and shown[0].names[1] != path:
-            shown[0].keep_ions(before)
+        before, ranges = shown[0], path if path.lower().endswith(RANGES) else None
+        if ranges is None or before is None or not isinstance(before.ions_of_file, MeasuredIons):
+            path = path if ranges is None else measurement_of(path)
+            shown = with_file(path)
+            remember_file(path)
+            if before is not None and shown[0] is not None and shown[0].names[1] != path:
+                shown[0].keep_ions(before)
+        if ranges is not None and shown[0] is not None and isinstance(shown[0].ions_of_file, MeasuredIons):
+            shown[0].ions_of_file.ranges = ranges
 
         def make_again():
             document.clear()

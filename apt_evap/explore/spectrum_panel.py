@@ -26,13 +26,18 @@ from bokeh.plotting import figure
 
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
 from apt_evap.explore.search_process import start_thread
+from apt_evap.explore.start_page import ranges_near
 from apt_evap.explore.widgets import LEFT
+from apt_evap.io.formats import read_ranges
 from apt_evap.io.rrng import write_rrng
+from apt_evap.spectra.composition import Composition
+from apt_evap.spectra.isotope_comb import in_intervals
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
 _CURVE = "#8298b0"  # seen in both styles
+_UNEXPLAINED = "#ff4040"
 _ALL = "all ions"
 _OF_MASS = "ions of a range"
 
@@ -65,6 +70,8 @@ class SpectrumPanel:
         self._ions, self._selected, self._crystal, self._later = ions, selected, crystal, later
         self._path = Path(f"{Path(name).stem or 'ions'}.rrng")
         self._confirmed = False
+        self.shown: list[Callable[[Spectrum], None]] = []
+        """Called with each spectrum that is shown."""
         self.named: Spectrum | None = None
         """The spectrum that is shown."""
         number = ions.number
@@ -77,16 +84,17 @@ class SpectrumPanel:
             width=LEFT - 20,
         )  # fmt: skip
         self.slider.on_change("value_throttled", lambda attr, old, new: self._select())
+        self._pending: IonSelection | None = None  # the one that is being selected
         self.choice = Select(title="masses", options=[_ALL], value=_ALL, width=LEFT - 10)
         self.choice.on_change("value", lambda attr, old, new: self._select())
         self.told = Div(width=LEFT - 10)
         self.controls: list[Any] = [self.choice, self.slider, self.told]
-        self._make_spectrum()
+        self._make_spectrum(name)
         self._tell()
         if ions.has_masses:
             self._name_peaks()
 
-    def _make_spectrum(self):
+    def _make_spectrum(self, name):
         wheel, drag = WheelZoomTool(dimensions="width"), BoxSelectTool(dimensions="width")
         self.figure: Any = figure(
             sizing_mode="stretch_width", height=300, y_axis_type="log", tools=[wheel, drag], toolbar_location=None,
@@ -96,8 +104,8 @@ class SpectrumPanel:
         self.counts = ColumnDataSource({"x": [], "y": []})
         self.background = ColumnDataSource({"x": [], "y": []})
         self.labels = ColumnDataSource({"x": [], "y": [], "label": [], "color": []})
-        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.35,
-                         line_color="color")  # fmt: skip
+        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.25,
+                         line_color="color", line_alpha=0.4)  # fmt: skip
         self.figure.step("x", "y", source=self.counts, mode="after", line_color=_CURVE)
         self.figure.line("x", "y", source=self.background, line_color=_CURVE, line_dash="dashed")
         self.figure.add_layout(
@@ -105,7 +113,7 @@ class SpectrumPanel:
                      y_offset=2, text_align="center")
         )  # fmt: skip
         self.unexplained = ColumnDataSource({"x": [], "y": []})
-        self.figure.scatter("x", "y", source=self.unexplained, marker="inverted_triangle", size=9, color="#ff4040")
+        self.figure.scatter("x", "y", source=self.unexplained, marker="inverted_triangle", size=9, color=_UNEXPLAINED)
         self.figure.on_event(SelectionGeometry, self._dragged)
         self.figure.on_event(Tap, self._clicked)
         self.elements = TextInput(title="ions to name", placeholder="such as W, CrO", width=145)
@@ -115,16 +123,28 @@ class SpectrumPanel:
             visible=self._ions.all.mass_to_charge is None and not self._ions.lacks_times,
         )  # fmt: skip
         self.distance.on_change("value", lambda attr, old, new: self._distance_changed())
+        self.use = Button(label="use", visible=False, margin=(23, 5, 5, 5))
+        self.use.on_click(self._use_fitted)
+        files = ranges_near(name) if self._ions.file.species is None else []
+        if self._ions.ranges is not None:
+            files = list(dict.fromkeys([self._ions.ranges, *files]))
+        self.file = Select(
+            title="ranges", options=[("", "by isotopes"), *((path, Path(path).name) for path in files)],
+            value=self._ions.ranges or "", width=130, visible=bool(files),
+        )  # fmt: skip
+        self.file.on_change("value", lambda attr, old, new: self._ranges_changed())
         self.save = Button(label="save ranges", width=100, margin=(23, 5, 5, 5), disabled=True)
         self.save.on_click(self._save)
         why = "reading the masses" if self._ions.has_masses else "no masses: the file has no m/n"
         if self._ions.lacks_distance:
             why = "Masses follow from the times of flight: type the flight length of the instrument."
-        self.text = Div(text=why, sizing_mode="stretch_width")
+        self.text = Div(text=why, sizing_mode="stretch_width", min_width=330)
+        self.composition = Div(width=270)
         self.peak = Div(sizing_mode="stretch_width")
         self.widgets: list[Any] = [
-            row(self.elements, self.distance, self.save, styles={"flex-wrap": "wrap"}), self.figure, self.peak,
-            self.text,
+            row(self.elements, self.file, self.distance, self.use, self.save, styles={"flex-wrap": "wrap"}),
+            self.figure, self.peak,
+            row(self.composition, self.text, sizing_mode="stretch_width", styles={"flex-wrap": "wrap"}),
         ]  # fmt: skip
 
     # ---- the spectrum ----------------------------------------------------------------------------------------------
@@ -133,6 +153,17 @@ class SpectrumPanel:
         if self.distance.value:
             self._ions.distance = self.distance.value
             self._name_peaks()
+
+    def _use_fitted(self):
+        """Take the fitted flight in place of the typed one."""
+        if self._ions.flight is not None:
+            distance, self._ions.time_zero = self._ions.flight
+            self.distance.value = distance
+
+    def _ranges_changed(self):
+        self._ions.ranges = self.file.value or None
+        self.choice.value = _ALL
+        self._name_peaks()
 
     def _name_peaks(self):
         """Compute the spectrum in a thread."""
@@ -147,16 +178,22 @@ class SpectrumPanel:
 
     def _put(self, named, by_itself):
         self.named = named
-        if named.flight is not None and named.flight.peaks:  # its masses are those of the figure
-            self._ions.distance, self._ions.time_zero = (
-                round(named.flight.distance, 2),
-                round(named.flight.time_zero, 2),
-            )
+        fitted = self._ions.flight
+        self.use.visible = fitted is not None and fitted[0] != self.distance.value
+        if fitted is not None:
+            self.use.label = f"use fitted {fitted[0]:g}"
         self._draw()
-        parts = [escape(line) for line in str(named).splitlines()]
-        self.text.text = "Drag over peaks to see the map of their ions.<br>" + "<br>".join(parts)
-        self.peak.text = "Click a peak to see which ions it may be."
+        for show in self.shown:
+            show(named)
+        self.composition.text = _composition_table(named.composition)
+        composed = len(str(named.composition).splitlines()) - 1
+        parts = [escape(line) for line in str(named).splitlines()[:-composed]]
+        parts[0] = f'<span style="color: {_UNEXPLAINED}">▼</span> {parts[0]}'
+        self.text.text = "<br>".join(parts)
+        self.peak.text = "Click a peak to see which ions it may be; drag over peaks to see the map of their ions."
         formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
+        if self._ions.ranges is not None:
+            formulas = list(read_ranges(self._ions.ranges).species_names)
         main = main_element(named)
         chosen = self._ions.selection
         options = [_ALL, *(f"ions of {formula}" for formula in formulas)]
@@ -236,18 +273,50 @@ class SpectrumPanel:
             element = self.choice.value.removeprefix("ions of ")
         first, last = (int(end) for end in self.slider.value)
         ions = None if (first, last) == (0, self._ions.number) else (first, max(last, first + 1))
-        selection = IonSelection(element, mass, ions)
-        if selection == self._ions.selection:
+        selection = IonSelection(element, mass, ions, None if element is None else self._ions.ranges)
+        if selection == (self._pending or self._ions.selection):
             return
+        self._pending = selection
         self.told.text = "selecting ions"
+        self._show_at_once(selection)
 
         def work():
             self._ions.select(selection)
-            self._later(self._put_selection, 0)
+            self._later(partial(self._put_selection, selection), 0)
 
-        start_thread(work, lambda sentence: self._later(partial(setattr, self.told, "text", escape(sentence)), 0))
+        def failed(sentence):
+            self._later(partial(self._not_selected, selection, escape(sentence)), 0)
 
-    def _put_selection(self):
+        start_thread(work, failed)
+
+    def _show_at_once(self, selection):
+        """Show the ions by the intervals of the spectrum, until those of the selection are known."""
+        if self.named is None:
+            return
+        hits = self.named.hits
+        low, high = selection.ions or (0, self._ions.number)
+        ions = hits.ion if hits.ion is not None else np.arange(len(hits))
+        inside = (ions >= low) & (ions < high)
+        intervals = [selection.mass] if selection.mass is not None else self._intervals(selection.element)
+        if intervals:
+            inside &= in_intervals(hits.mass_to_charge, intervals)
+        elif selection.element is not None:
+            return
+        if inside.any():
+            self._ions.show(hits[inside])
+            self._selected()
+
+    def _not_selected(self, selection, sentence):
+        if self._pending == selection:
+            self._pending = None
+            self._ions.select(self._ions.selection)
+            self._selected()
+            self.told.text = sentence
+
+    def _put_selection(self, selection):
+        if self._pending != selection:  # a newer one is being selected
+            return
+        self._pending = None
         if self._ions.selection.mass is not None:
             self.choice.value = _OF_MASS
         self._tell()
@@ -256,12 +325,21 @@ class SpectrumPanel:
     def _tell(self):
         selection = self._ions.selection
         number, of = len(self._ions.hits), len(self._ions.all)
-        chosen = [] if self.named is None else [ion for ion in self.named.ions if ion.formula == selection.element]
-        intervals = [interval for ion in chosen for interval in ion.intervals]
+        intervals = self._intervals(selection.element)
         if selection.mass is not None:
             intervals = [selection.mass]
         where = ", ".join(f"{low or 0:.4g} to {high or np.inf:.4g}" for low, high in intervals)
         self.told.text = f"{number:,} of {of:,} ions" + (f", {where} Da" if where else "")
+
+    def _intervals(self, element):
+        """Bounds of the peaks of an element, or of the ranges of a species [Da]."""
+        if element is None or self.named is None:
+            return []
+        if self._ions.ranges is not None:
+            ranges = read_ranges(self._ions.ranges)
+            rows = zip(ranges.names, ranges.low.tolist(), ranges.high.tolist(), strict=True)
+            return [(low, high) for name, low, high in rows if name == element]
+        return [interval for ion in self.named.ions if ion.formula == element for interval in ion.intervals]
 
     def _save(self):
         """Save the ranges of the named peaks; a file that exists is replaced only by a second click."""
@@ -277,3 +355,18 @@ class SpectrumPanel:
             self.text.text = f"wrote {escape(str(path))}"
         except (ValueError, OSError) as error:
             self.text.text = escape(str(error))
+
+
+def _composition_table(composition: Composition) -> str:
+    """Elements with at.%, errors and the span over other names, as HTML."""
+    if composition.refused:
+        return f"<b>no composition</b><br>{escape(composition.refused)}"
+    rows = []
+    for element, value in composition.at_percent.items():
+        low, high = composition.span[element]
+        span = f"<small>{low:.2f} to {high:.2f}</small>" if high - low > max(composition.error[element], 0.005) else ""
+        rows.append(
+            f"<tr><td><b>{escape(element)}</b></td><td style='text-align: right'>{value:.2f}</td>"
+            f"<td>± {composition.error[element]:.2f}</td><td>{span}</td></tr>"
+        )
+    return f"<table style='white-space: nowrap'><tr><td colspan=4><b>composition [at.%]</b></td></tr>{''.join(rows)}</table>"

@@ -21,6 +21,8 @@ from apt_evap.maps.indexing.master_pattern import master_patterns
 
 RUNS, MEASUREMENTS = (".h5",), (".epos", ".pos", ".apt", ".raw", ".nxs", ".npz")
 """Suffixes of files that can be opened."""
+RANGES = (".rrng", ".rng", ".env", ".xrng")
+"""Suffixes of ranges of mass, which are shown with a measurement."""
 EXAMPLE = "example_ni111.npz"
 """File of the example, a map as nickel gives it; it is written when it is opened."""
 _MOST = 40  # files of a kind
@@ -28,9 +30,10 @@ _LARGEST_SETTINGS = 1 << 20  # bytes
 _UNITS = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 _CARDS = ":host { display: grid; grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); gap: 24px; }"
 _CARD = """
-:host .bk-btn.bk-btn-default { text-align: left; border: none; background: transparent; padding: 6px 8px;
-  color: var(--ink); font-size: 14px; }
-:host .bk-btn.bk-btn-default:hover { background: var(--panel); color: var(--ink); }
+:host .bk-btn.bk-btn-default { text-align: left; border: 1px solid var(--edge); border-radius: 6px; padding: 7px 10px;
+  background: var(--panel); color: var(--link); font-size: 14px; cursor: pointer; }
+:host .bk-btn.bk-btn-default:hover { border-color: #2f6fb3; text-decoration: underline; }
+:host .bk-btn.bk-btn-default::after { content: "→"; float: right; color: var(--faint); }
 """
 _DROP_STYLE = """
 :host { border: 2px dashed var(--edge); border-radius: 12px; padding: 28px; text-align: center; font-size: 16px; }
@@ -61,6 +64,7 @@ class StartPage:
         cards = [
             self._card("Measurements in this folder", folder[0], "no .epos, .pos, .apt, .raw, .nxs or .npz"),
             self._card("Runs in this folder", folder[1], "no .h5"),
+            self._card("Ranges, with their measurement", folder[2], "no .rrng, .rng, .env or .xrng"),
             self._card("Settings: a click simulates", _settings(), "no .toml of a simulation"),
             self._card("Opened last", [path for path in recent_files() if Path(path).is_file()], "nothing yet"),
             self._card("Example", [EXAMPLE], ""),
@@ -91,7 +95,8 @@ class StartPage:
         more = len(paths) - _MOST
         text = f"{more} more: type their names above" if more > 0 else "" if rows else empty
         head = Div(text=f"<b>{title}</b>", styles={"font-size": "15px"})
-        return column(head, *rows, *([Div(text=f"<small>{text}</small>")] if text else []))
+        told = [Div(text=f"<small>{text}</small>")] if text else []
+        return column(head, *rows, *told, sizing_mode="stretch_width")
 
     def close(self) -> None:
         """Show the run no longer; it goes on."""
@@ -124,10 +129,33 @@ def files_to_open() -> list[str]:
     return [path for kind in _files() for path in kind]
 
 
+def ranges_near(path: str) -> list[str]:
+    """Files of ranges in the folder of a measurement, those with its name first."""
+    stem, folder = Path(path).stem, Path(path).parent
+    found = [str(each) for each in sorted(folder.glob("*")) if each.suffix.lower() in RANGES and each.is_file()]
+    return sorted(found, key=lambda each: Path(each).stem != stem)
+
+
+def measurement_of(ranges: str) -> str:
+    """The measurement of a file of ranges: that of its name, or the only one of its folder.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or several.
+    """
+    found = [each for each in sorted(Path(ranges).parent.glob("*")) if each.suffix.lower() in MEASUREMENTS[:-1]]
+    same = [each for each in found if each.stem == Path(ranges).stem]
+    if len(same or found) != 1:
+        many = ", ".join(each.name for each in (same or found)[:4]) or "none"
+        raise ValueError(f"open the measurement of {Path(ranges).name} first: in its folder are {many}")
+    return str((same or found)[0])
+
+
 def _files():
-    """Measurements and runs in the current folder and the folders in it."""
+    """Measurements, runs and ranges in the current folder and the folders in it."""
     paths = [path for pattern in ("*", "*/*") for path in sorted(Path().glob(pattern)) if path.is_file()]
-    return tuple([str(path) for path in paths if path.suffix.lower() in kind] for kind in (MEASUREMENTS, RUNS))
+    return tuple([str(path) for path in paths if path.suffix.lower() in kind] for kind in (MEASUREMENTS, RUNS, RANGES))
 
 
 def _settings():

@@ -3,8 +3,22 @@
 from bokeh.themes import Theme
 
 _COLORS = {
-    "dark": {"paper": "#15181c", "panel": "#1e2329", "ink": "#e3e6ea", "faint": "#98a2ad", "edge": "#3a424c"},
-    "light": {"paper": "#ffffff", "panel": "#f4f5f7", "ink": "#17191c", "faint": "#6b7480", "edge": "#c9ced4"},
+    "dark": {
+        "paper": "#15181c",
+        "panel": "#1e2329",
+        "ink": "#e3e6ea",
+        "link": "#8cc4ff",
+        "faint": "#98a2ad",
+        "edge": "#3a424c",
+    },
+    "light": {
+        "paper": "#ffffff",
+        "panel": "#f4f5f7",
+        "ink": "#17191c",
+        "link": "#1c5b9e",
+        "faint": "#6b7480",
+        "edge": "#c9ced4",
+    },
 }
 STYLES = tuple(_COLORS)
 """Names of the styles."""
@@ -33,6 +47,11 @@ small { font-size: 12px; color: var(--faint); }
   border-color: var(--edge); padding: 6px 14px; box-shadow: none; }
 :host(.tabs) .bk-btn.bk-active { background: transparent; color: var(--ink); border-color: #2f6fb3; font-weight: 600; }
 pre { white-space: pre-wrap; color: var(--ink); }
+progress { appearance: none; height: 8px; border: 1px solid var(--edge); border-radius: 4px; overflow: hidden;
+  background: var(--panel); vertical-align: middle; }
+progress::-webkit-progress-bar { background: var(--panel); }
+progress::-webkit-progress-value { background: #2f6fb3; }
+progress::-moz-progress-bar { background: #2f6fb3; }
 table { border-spacing: 8px 0; }
 """
 """CSS of all widgets; the colours follow those of the page."""

@@ -53,6 +53,11 @@ class SummaryPanel:
         if maps is self._maps:
             self._put_numbers(maps)
 
+    def put_verdict(self) -> None:
+        """Show the verdict again, with the materials that are now known."""
+        if self._maps is not None and not self._maps.preview:
+            self._put_numbers(self._maps)
+
     def note(self, sentence: str) -> None:
         """Show a sentence, in place of all notes."""
         self._put_notes([sentence])
@@ -84,6 +89,7 @@ class SummaryPanel:
                 sentence += f"; two halves of the measurement have {maps.ceiling.value:.2f}"
         elif registration.doubtful:
             sentence += f"; the correlation of the registered maps is only {registration.score:.2f}"
+        sentence = _materials(self._explorer) + sentence
         return (
             f'<b title="{escape(likeness.reason)}" style="background: {_COLORS[likeness.verdict]}; color: white;'
             f' border-radius: 10px; padding: 2px 10px; white-space: nowrap">{likeness.verdict}</b> {escape(sentence)}'
@@ -91,6 +97,17 @@ class SummaryPanel:
 
     def _put_notes(self, notes: Sequence[str]) -> None:
         self.notes.update(text="<br>".join(map(escape, notes)), visible=bool(notes))
+
+
+def _materials(explorer):
+    """Materials of the run and of the measurement, as the beginning of a sentence; "" if one is not known."""
+    measured = explorer.crystal_of_ions or explorer.crystal
+    simulated = explorer.run.settings["tip"].get("material", {}).get("name") or ", ".join(explorer.run.elements)
+    if not measured or not simulated:
+        return ""
+    if measured == simulated:
+        return f"{simulated}, simulated and measured: "
+    return f"the run is {simulated}, the measured ions are {measured}: "
 
 
 def _facts(explorer):

@@ -10,7 +10,7 @@ from tornado.web import HTTPError, RequestHandler, stream_request_body
 
 from apt_evap._common.files import new_file, open_regular
 from apt_evap._common.validation import short_text
-from apt_evap.explore.start_page import MEASUREMENTS, RUNS
+from apt_evap.explore.start_page import MEASUREMENTS, RANGES, RUNS
 
 _LARGEST = 64 << 30  # bytes
 _LONGEST = 200  # bytes of a name: file systems have 255, and the temporary name is longer
@@ -48,8 +48,8 @@ class UploadHandler(RequestHandler):
         is_plain = name == self._path.name and name not in ("", ".", "..") and "\\" not in name and name.isprintable()
         if not is_plain or len(os.fsencode(name)) > _LONGEST:
             self._refused = f"a dropped file must have a plain name of at most {_LONGEST} bytes, got {short_text(name)}"
-        elif self._path.suffix.lower() not in (*RUNS, *MEASUREMENTS):
-            known = ", ".join((*MEASUREMENTS, *RUNS))
+        elif self._path.suffix.lower() not in (*RUNS, *MEASUREMENTS, *RANGES):
+            known = ", ".join((*MEASUREMENTS, *RUNS, *RANGES))
             self._refused = f"a dropped file must be one of {known}, got {short_text(name)}"
         elif os.path.lexists(self._path):
             self._guarded(self._open_present)

@@ -182,6 +182,17 @@ class Tabs:
             place.visible = number == self.choice.active
 
 
+def progress_text(part: float, seconds: float, doing: str) -> str:
+    """HTML of a bar that fills, with what goes on and the time left by its own rate after some seconds."""
+    left = "" if part <= 0 or seconds <= 0 else f", about {duration(seconds / part * (1 - part))} left"
+    return f'<progress value="{part:.3g}" max="1" style="width: 120px"></progress> <small>{doing}{left}</small>'
+
+
+def duration(seconds: float) -> str:
+    """Seconds, or minutes, as words."""
+    return f"{seconds / 60:.0f} min" if seconds > 100 else f"{seconds:.0f} s"
+
+
 def copy_button(label: str, text: Any) -> Button:
     """Button that copies a text and says so."""
     button = Button(label=label, width=150)

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,12 @@ def registration_start(centre: Sequence[float], scale: float) -> dict[str, Any]:
     return _bounded(Registration(0.0, 1.0, (x, y)), scale)
 
 
-def index_as_run(measured: DetectorMap, crystal: Orientation | None, distance: float | None = None) -> Indexing | None:
+def index_as_run(
+    measured: DetectorMap,
+    crystal: Orientation | None,
+    distance: float | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Indexing | None:
     """Index a map for the crystal of a run.
 
     Parameters
@@ -58,6 +63,8 @@ def index_as_run(measured: DetectorMap, crystal: Orientation | None, distance: f
         Crystal of the run.
     distance : float, optional
         Flight length of the instrument [mm], which bounds the scale.
+    progress : callable, optional
+        As for `index`.
 
     Returns
     -------
@@ -68,7 +75,7 @@ def index_as_run(measured: DetectorMap, crystal: Orientation | None, distance: f
     if crystal is None or (measured.is_counts and (measured.ions or 0) < LEAST_IONS):
         return None
     try:
-        return index(measured, crystal.material, distance=distance)
+        return index(measured, crystal.material, distance=distance, progress=progress)
     except ValueError:  # no patterns, or a map that is too small, or one of another instrument
         return None
 

@@ -305,7 +305,7 @@ def test_a_run_is_registered_where_the_indexed_map_has_its_axis(run20, measured,
         explorer = Explorer(run20, measured)
         indexing = SimpleNamespace(decided=decided, best=candidate, map=measured.map(64))
 
-        def call(function, arguments, indexing=indexing):
+        def call(function, arguments, *_, indexing=indexing):
             called.append(function.__name__)
             return indexing if function is index_as_run else ae.Registration(0.0, 0.5, arguments[2]["start"].shift)
 

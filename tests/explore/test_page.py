@@ -427,7 +427,7 @@ def test_the_registration_arrives(run, measured, monkeypatch):
     throttled(page.emission.sliders["mean"], 0.3)  # the page goes on
     opened.settle(opened.shows)
     go.release()
-    opened.settle(lambda: 'value="1"' in page.registration.status.text and page.explorer.registered)
+    opened.settle(lambda: 'value="0.5"' in page.registration.status.text and page.explorer.registered)
     opened.settle(opened.shows)
     assert not re.search(r">(alike|not alike|doubtful)</b>", page.summary.readout.text)  # not of the first emission
     go.release()

@@ -106,7 +106,7 @@ def test_a_flight_length_bounds_the_scale_of_a_search_unless_one_is_typed(measur
         def __exit__(self, *_):
             pass
 
-        def call(self, function, arguments, options):
+        def call(self, function, arguments, options, progress):
             called.append(options)
             raise ValueError("enough")
 
