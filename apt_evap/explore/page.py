@@ -25,6 +25,7 @@ from apt_evap.explore.mouse_tools import MouseTools
 from apt_evap.explore.newest_task import NewestTaskRunner
 from apt_evap.explore.pole_panel import PolePanel
 from apt_evap.explore.profile_panel import ProfilePanel
+from apt_evap.explore.reconstruction_panel import ReconstructionPanel
 from apt_evap.explore.registration_panel import RegistrationPanel
 from apt_evap.explore.rings_panel import RingsPanel
 from apt_evap.explore.run_panel import RunPanel
@@ -159,6 +160,11 @@ class Page:
                 explorer, lambda: emission.perturbation, registration_of, request, note, self._later, self.summary.judge
             )
             self._panels.append(self.registration)
+        emission, spectrum = self.emission, self.spectrum
+        self.reconstruction = ReconstructionPanel(
+            explorer, (lambda: emission.perturbation) if emission is not None else None,
+            (lambda: spectrum.named) if spectrum is not None else None, self._material, self._later,
+        )  # fmt: skip
         self.tools = MouseTools(figures, tools, self.figures.show_whole)
         if explorer.is_comparison:
             self.tools.choice.on_change("active", lambda attr, old, new: self._show_candidate())
@@ -185,6 +191,8 @@ class Page:
 
     def _material(self):
         """Name of the crystal of the run or of the command, if it is one of the table."""
+        if self.index is not None and self.index.material.value:
+            return self.index.material.value
         if self.explorer.run is not None:
             material = self.explorer.run.settings["tip"].get("material", {})
             if material.get("name") in MATERIALS:
@@ -227,6 +235,8 @@ class Page:
             contents["spectrum"] = self.spectrum.widgets
         if self.correlation is not None and self.correlation.has_pulses:
             contents["correlation"] = self.correlation.widgets
+        if self.reconstruction.has_ions:
+            contents["reconstruction"] = self.reconstruction.widgets
         contents |= {"profile": self.profile.widgets, "code": self.code.widgets}
         tools = [self.tools.row] if self.poles is None else [self.tools.row, self.poles.button]
         self.tabs = Tabs(contents)

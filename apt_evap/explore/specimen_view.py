@@ -7,7 +7,7 @@ from bokeh.events import Pan, PanStart
 from bokeh.models import ColumnDataSource, CustomJS, LinearColorMapper, WheelZoomTool
 from bokeh.palettes import Viridis256
 
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap.explore.specimen_surface import COLORED_BY, SurfaceAtoms
 from apt_evap.explore.widgets import color_bar, show_extent, square
 
@@ -26,6 +26,7 @@ const project = (x, y, z) => {
   return [x * ca - y * sa, z * ce + away * se, z * se - away * ce]
 }
 const {x, y, z, color} = points.data
+if (!x.length || !source.data.image.length) return
 const image = source.data.image[0], n = Math.sqrt(image.length)
 const half = source.data.dw[0] / 2, pixel = 2 * half / n, radius = Math.max(points.data.radius[0] / pixel, 1)
 const depth = new Float32Array(n * n).fill(-Infinity)
@@ -53,7 +54,7 @@ marked.data.y = places.map(place => place[1])
 marked.change.emit()
 """
 _RADIUS = 0.6  # of a sphere, in nearest neighbour distances: few atoms behind are seen through the gaps
-_WIDEST = 480  # px, of the figure: its controls are beside it where there is place
+_WIDEST = 360  # px, of the figure: its controls are beside it where there is place
 _GRASP = "points.grasped = [cb_obj.sx, cb_obj.sy, ...points.tags]"
 _TURN = """
 const [x, y, azimuth, elevation] = points.grasped
@@ -64,9 +65,9 @@ points.tags = [azimuth + (cb_obj.sx - x) / 2, Math.max(-90, Math.min(90, elevati
 class SpecimenView:
     """Figure of the atoms of a surface."""
 
-    def __init__(self) -> None:
+    def __init__(self, title: str = "specimen: drag to turn it") -> None:
         wheel = WheelZoomTool()
-        self.figure: Any = square("specimen: drag to turn it", (-1, 1, -1, 1), [wheel])
+        self.figure: Any = square(title, (-1, 1, -1, 1), [wheel])
         self.figure.toolbar.active_scroll = wheel
         self.figure.axis.visible = False
         self.figure.update(styles=self.figure.styles | {"max-width": f"{_WIDEST}px"})
@@ -93,22 +94,25 @@ class SpecimenView:
 
     def put(self, atoms: SurfaceAtoms, color: str) -> None:
         """Show the atoms of a surface, coloured by one of `COLORED_BY`."""
-        low, high = atoms.positions.min(axis=0), atoms.positions.max(axis=0)
-        self.centre = (low + high) / 2
-        x, y, z = (atoms.positions - self.centre).astype(np.float32).T
-        half = float(np.sqrt(x * x + y * y + z * z).max()) + atoms.diameter
         first, last = (float(end) for end in np.percentile(atoms.values, [1, 99]))
         last = last if last > first else first + 1
         self.colors.update(low=first, high=last)
         self.bar.title = COLORED_BY[color]
         steps = np.clip((atoms.values - first) / (last - first), 0, 1) * 255
+        self.put_spheres(atoms.positions, _PALETTE[steps.astype(int)], _RADIUS * atoms.diameter)
+
+    def put_spheres(self, positions: Floats, colors: Integers, radius: float) -> None:
+        """Show spheres at positions [nm], shape (n, 3), with colours as of `pixel_color` and one radius [nm]."""
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        self.centre = (low + high) / 2
+        x, y, z = (positions - self.centre).astype(np.float32).T
+        half = float(np.sqrt(x * x + y * y + z * z).max()) + 2 * radius
         self.source.data = {
             "image": [np.zeros((PIXELS, PIXELS), np.uint32)], "x": [-half], "y": [-half],
             "dw": [2 * half], "dh": [2 * half],
         }  # fmt: skip
         self.points.data = {
-            "x": x, "y": y, "z": z, "color": _PALETTE[steps.astype(int)],
-            "radius": np.full(len(x), _RADIUS * atoms.diameter, np.float32),
+            "x": x, "y": y, "z": z, "color": colors, "radius": np.full(len(x), radius, np.float32),
         }  # fmt: skip
         show_extent(self.figure, (-half, half, -half, half))
 
@@ -121,6 +125,16 @@ class SpecimenView:
         """Turn to one of `SIDES`."""
         self.points.tags = list(SIDES[side])
 
+    def turn_with(self, other: "SpecimenView") -> None:
+        """Turn both views together."""
+        for one, two in ((self.points, other.points), (other.points, self.points)):
+            code = "if (String(two.tags) != String(one.tags)) two.tags = [...one.tags]"
+            one.js_on_change("tags", CustomJS(args={"one": one, "two": two}, code=code))
 
-# red is the lowest byte of a pixel
-_PALETTE = np.array([int(color[5:7] + color[3:5] + color[1:3], 16) for color in Viridis256], np.int32)
+
+def pixel_color(color: str) -> int:
+    """Colour such as "#ff0000" as a pixel: red is the lowest byte."""
+    return int(color[5:7] + color[3:5] + color[1:3], 16)
+
+
+_PALETTE = np.array([pixel_color(color) for color in Viridis256], np.int32)

@@ -369,4 +369,5 @@ def _composition_table(composition: Composition) -> str:
             f"<tr><td><b>{escape(element)}</b></td><td style='text-align: right'>{value:.2f}</td>"
             f"<td>± {composition.error[element]:.2f}</td><td>{span}</td></tr>"
         )
-    return f"<table style='white-space: nowrap'><tr><td colspan=4><b>composition [at.%]</b></td></tr>{''.join(rows)}</table>"
+    head = "<tr><td colspan=4><b>composition [at.%]</b></td></tr>"
+    return f"<table style='white-space: nowrap'>{head}{''.join(rows)}</table>"

@@ -117,7 +117,7 @@ def _facts(explorer):
     if explorer.run is not None:
         run = explorer.run
         tip = run.settings["tip"]
-        parts = [f"{len(run):,} ions of {', '.join(run.elements)}"]
+        parts = [f"{len(run):,} ions of {', '.join(dict.fromkeys(run.elements))}"]
         if "axis" in tip:
             parts.append(f"[{' '.join(f'{index:g}' for index in tip['axis'])}]")
         if tip.get("apex_radius"):

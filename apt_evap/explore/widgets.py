@@ -22,14 +22,17 @@ LEFT = 300
 _NARROWEST = 290  # px, of a map: two of them stand side by side in a window of 1000 px
 _ABOVE = 120  # px of the window above and below a map
 _RATIO = 0.9  # width over height of a map, with its axes and colour bar
+_LOWER = f"{_RATIO} * max(320px, 100vh - 400px)"  # of two maps above the tabs: their upper half is seen, too
 _WIDEST = f"{_RATIO} * max(300px, 100vh - {_ABOVE}px)"
-# one map has the tabs beside it; two maps only if a window is so wide that its height limits them
+# one map has the tabs beside it; two maps only in a wide window
 _WORK = f"""
 :host {{ display: grid; grid-template-columns: minmax(0, 1fr); gap: 12px; align-items: start; }}
 @media (min-width: 1150px) {{ :host(.one) {{ grid-template-columns: minmax(0, calc({_WIDEST})) minmax(360px, 1fr); }} }}
-:host(.two) {{ display: flex; flex-flow: row wrap; }}
-:host(.two) > div {{ flex: 1 1 360px; }}
-:host(.two) > div:first-of-type {{ flex: 1 1 calc(2 * {_WIDEST}); max-width: calc(2 * {_WIDEST}); }}
+:host(.two) > div:first-of-type {{ max-width: calc(2 * {_LOWER}); }}
+@media (min-width: 1500px) {{
+  :host(.two) {{ grid-template-columns: minmax(0, calc(2 * {_WIDEST})) minmax(380px, 1fr); }}
+  :host(.two) > div:first-of-type {{ max-width: none; }}
+}}
 """
 
 # the frame of a figure is seldom square: the longer direction shows more, so that both have the same scale

@@ -14,6 +14,7 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.color_limits import color_limits, common_limits
+from apt_evap.detection.timing import mass_to_charge
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.specimen_surface import surface_atoms
 
@@ -34,6 +35,7 @@ from apt_evap.explore.page import Page
 from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.server import serve
 from apt_evap.io.measured_file import MeasuredFile
+from apt_evap.io.rrng import write_rrng
 
 SECONDS = 60  # until a test gives up: the machine may be busy
 
@@ -710,6 +712,68 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     panel._save()
     assert len(ae.io.read_ranges("ions.rrng")) == len(saved)
     page.document.validate()
+    page.close()
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
+    """Species of a file of ranges are selected as its command selects them; a fitted flight length is only offered."""
+    monkeypatch.chdir(tmp_path)
+    rng, n = np.random.default_rng(5), 20_000
+    mass = rng.choice([62.93, 64.93, 13.988], n, p=[0.5, 0.22, 0.28]) * rng.normal(1.0, 3e-4, n)
+    x, y = rng.normal(size=(2, n)) * 8.0
+    volts = np.full(n, 5000.0)
+    time = np.sqrt(mass / mass_to_charge(volts, np.ones(n), x, y, 90.0))
+    ranges = ae.spectra.Ranges(["Cu", "Si"], [62.0, 13.5], [66.0, 14.5], composition=[{"Cu": 1}, {"Si": 1}])
+    write_rrng("ions.rrng", ranges)
+    hits = ae.Hits(x=x, y=y, voltage=volts, time_of_flight=time, pulse_id=np.arange(n) // 2)
+    opened = Opened(Explorer(None, hits, file=MeasuredFile("ions.epos", distance=92.0)))
+    page, panel = opened.page, opened.page.spectrum
+    opened.settle(lambda: panel.text.text != 'naming the peaks' and panel._pending is None)
+    assert panel.named is not None, panel.text.text
+    fitted = page.explorer.ions_of_file.flight
+    assert panel.distance.value == page.explorer.distance == 92.0 and fitted[0] == pytest.approx(90.0, abs=0.5)
+    assert panel.use.visible and f"{fitted[0]:g}" in panel.use.label
+    panel.file.value = "ions.rrng"
+    opened.settle(lambda: panel.named.ranged and panel._pending is None)
+    panel.choice.value = "ions of Si"
+    opened.settle(lambda: panel._pending is None and page.explorer.ions_of_file.selection.element == "Si")
+    assert abs(len(page.explorer.measured) - (mass < 20).sum()) < 20
+    assert {"--ranges=ions.rrng", "--species=Si"} <= set(page.explorer.ions_of_file.arguments)
+    panel.file.value = ""
+    opened.settle(lambda: not panel.named.ranged and panel._pending is None)
+    assert not [word for word in page.explorer.ions_of_file.arguments if word.startswith("--species")]
+    panel._use_fitted()
+    opened.settle(lambda: panel.distance.value == fitted[0] == page.explorer.distance)
+    page.correlation._compute()
+    opened.settle(lambda: page.correlation.figure.visible)
+    counted = np.nansum(page.correlation.pairs.data["image"][0])
+    assert counted == pytest.approx(n, rel=0.01)  # n / 2 pairs, at both places
+    page.close()
+
+
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
+def test_ions_are_reconstructed_beside_the_truth(run):
+    """The positions are those of `reconstruct`; the true sites turn with them; errors are told."""
+    opened = Opened(Explorer(run))
+    page, panel = opened.page, opened.page.reconstruction
+    panel._compute()
+    opened.settle(lambda: not panel.start.disabled)
+    assert panel.result is not None, panel.text.text
+    real = run.at_evaporation_field()
+    hits = real.hits(page.settings().perturbation)
+    expected = ae.reconstruct(hits, **ae.reconstruction.run_constants(real))
+    assert np.array_equal(panel.result.positions, expected.positions)
+    assert f"{expected.errors().lateral_rms:.2f} nm lateral" in panel.text.text
+    shown = np.sort(panel.truth.points.data["z"]) + panel.truth.centre[2]
+    assert shown == pytest.approx(np.sort(expected.hits.positions[:, 2]), abs=1e-4)
+    assert not panel.depth.visible and len(panel.view.points.data["x"]) == len(expected)
+    panel.species.active = []
+    page.document.validate()
+    panel.shape.value = "evolving"
+    panel._compute()
+    opened.settle(lambda: not panel.start.disabled)  # too few ions: the cap, or the reason
+    assert "cap" in panel.text.text or "ions" in panel.text.text
     page.close()
 
 

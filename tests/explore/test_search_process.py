@@ -85,6 +85,26 @@ def test_a_process_computes_fails_and_ends():
             process.call(abs, (-1,))
 
 
+def test_a_search_tells_its_progress_and_is_cancelled(measured):
+    with SearchProcess() as process:
+        told = []
+        assert process.call(_told, (3,), {}, told.append) == 3 and told == [0.0, 0.5]
+    later = Later()
+    panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)
+    panel._search(panel.search)
+    assert panel.cancel.visible and 'value="0"' in panel.text.text
+    later.settle(lambda: panel._process is not None)
+    panel._cancel()
+    later.settle(lambda: not panel.search.disabled)
+    assert "cancelled" in panel.text.text and not panel.cancel.visible
+
+
+def _told(result, progress):
+    for part in (0.0, 0.5):
+        progress(part)
+    return result
+
+
 def test_a_search_whose_process_is_killed_is_over(measured):
     later = Later()
     panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)

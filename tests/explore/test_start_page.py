@@ -22,7 +22,7 @@ from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import recent_files, remember_file
 from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.server import serve
-from apt_evap.explore.start_page import EXAMPLE, StartPage, write_example
+from apt_evap.explore.start_page import EXAMPLE, StartPage, measurement_of, ranges_near, write_example
 
 
 @pytest.fixture
@@ -94,6 +94,17 @@ def test_a_file_can_be_dropped_on_every_page(folder, page_of):
     assert asked == ["d.epos"]
     assert page.document.get_model_by_name("told of a dropped file") is not None
     page.close()
+
+
+def test_ranges_are_shown_with_their_measurement(folder):
+    (folder / "a.rrng").write_text("ranges")
+    (folder / "z.RNG").write_text("ranges")
+    start = StartPage(lambda path: None, ServerState(), lambda function, delay: None)
+    assert {"a.rrng", "z.RNG"} <= set(start.buttons)
+    assert measurement_of("a.rrng") == "a.epos" and ranges_near("z.epos") == ["z.RNG", "a.rrng"]
+    (folder / "b.pos").write_bytes(b"")
+    with pytest.raises(ValueError, match="first"):
+        measurement_of("z.RNG")
 
 
 def test_files_that_were_opened_last(folder, state_folder):
