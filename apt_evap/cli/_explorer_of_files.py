@@ -71,7 +71,6 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
             raise ValueError(f"RUN must be a run, {options.run!r} contains something else")
         options.run, options.file = None, options.run
     if run is not None:
-        run.require_responses(repr(options.run))
         run = in_real_units(run, options)
     measured = None if options.file is None else _measured(options)
     registration = None

@@ -39,7 +39,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "  apt-evap explore ni111.h5\n"
         "  apt-evap explore ni111.h5 R5083.epos --mass 27,29 --registration R5083_study/study.json"
     )
-    parser.add_argument("run", metavar="RUN.h5", nargs="?", help="a run with responses")
+    parser.add_argument("run", metavar="RUN.h5", nargs="?", help="a run; with responses for any emission")
     parser.add_argument("file", metavar="MEASURED", nargs="?", help="measured ions (.epos, ...) or a map (.npz)")
     parser.add_argument(
         "--registration",

@@ -171,7 +171,8 @@ class Explorer:
     Parameters
     ----------
     run : Run, optional
-        A run with responses, at the simulated voltage or in real units.
+        A run at the simulated voltage or in real units. Without responses only the emission that it was flown with is
+        shown.
     measured : Hits or MeasuredIons or DetectorMap, optional
         Measured ions, with a selection of them, or a map.
     registration : Registration, optional
@@ -189,7 +190,7 @@ class Explorer:
     Raises
     ------
     ValueError
-        If the run has no responses, or an argument is missing.
+        If an argument is missing.
     """
 
     def __init__(
@@ -206,7 +207,7 @@ class Explorer:
         if run is None and measured is None:
             raise ValueError("the explorer needs a run, measured ions or a measured map, got none")
         if run is not None:
-            check_kind(run, "run", Run, "a Run").require_responses()
+            check_kind(run, "run", Run, "a Run")
         if registration is not None:
             check_kind(registration, "registration", Registration, "a Registration")
             if measured is None or run is None:
@@ -281,16 +282,28 @@ class Explorer:
     @property
     def start(self) -> ExplorerSettings:
         """Settings at the start: roll-up with the energies of Shaikh et al. (2025) for nickel, smoothed by one bin."""
-        perturbation = perturbation_of("roll-up", _starting_values("roll-up"))
+        perturbation = self._emissions[-1]
+        if self.has_sliders:
+            perturbation = perturbation_of("roll-up", _starting_values("roll-up"))
         if isinstance(self.measured, DetectorMap):
             bins = max(self.measured.values.shape)
         else:
             bins = bins_for(len(self.run)) if self.measured is None else BINS
         return ExplorerSettings(perturbation, bins, self.smoothing_for(bins))
 
+    @property
+    def has_sliders(self) -> bool:
+        """Whether any emission can be shown: without a run, or for a run with responses."""
+        return self.run is None or self.run.responses is not None
+
+    @property
+    def _emissions(self) -> tuple[Perturbation, ...]:
+        """Emissions whose maps limit the common region."""
+        return (Unperturbed(), REGION) if self.has_sliders else (self.run.first_perturbation,)
+
     def _same_size(self):
         """Registration by the size of both fields of view alone."""
-        hits, target = self._preview_run.hits(Unperturbed()), measured_map(self.measured)
+        hits, target = self._preview_run.hits(self._emissions[0]), measured_map(self.measured)
         x, y = np.meshgrid(*target.centres)
         fields = [(hits.x[hits.detected], hits.y[hits.detected]), (x[target.mask], y[target.mask])]
         boxes = [np.percentile(field, [1, 99], axis=1) for field in fields]
@@ -353,6 +366,8 @@ class Explorer:
         if self.run is None or self.measured is None:
             raise ValueError("a registration needs a run, and measured ions or a measured map, got only one of them")
         target = measured_map(self.measured)
+        if perturbations is None and not self.has_sliders:
+            perturbations = self._emissions
         if perturbations is None:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
         call = apply or (lambda function, arguments, options={}, progress=None: function(*arguments, **options))
@@ -514,12 +529,12 @@ class Explorer:
 
     def _bins_of_run(self, bins):
         """Map on the complete detector, as `apt-evap map` makes it."""
-        return self.run.hits(Unperturbed()).map(like=self.run.grid(bins), position_step=None)
+        return self.run.hits(self._emissions[0]).map(like=self.run.grid(bins), position_step=None)
 
     def _region(self, bins, registration):
         measured = self._complete(bins)
         mask = measured.mask & field_of_view(np.where(measured.mask, measured.values, 0))
-        for perturbation in (Unperturbed(), REGION):
+        for perturbation in self._emissions:
             hits = registration.hits(self._preview_run.hits(perturbation))
             mask &= field_of_view(hits.map(like=measured, position_step=None).counts)
         if not mask.any():

@@ -129,7 +129,8 @@ class Page:
         self.rings: RingsPanel | None = None
         tools = {"line": self.profile.tool, "box": self.code.tool}
         if explorer.run is not None:
-            self.emission = EmissionPanel(explorer, maps.settings.perturbation, request)
+            if explorer.has_sliders:
+                self.emission = EmissionPanel(explorer, maps.settings.perturbation, request)
             self.ions = IonPanel(explorer, maps.settings.ions, request)
             self.specimen = SpecimenPanel(explorer, maps, figures)
             self.rings = RingsPanel(explorer, self._later)
@@ -155,14 +156,19 @@ class Page:
                 self.correlation = CorrelationPanel(explorer.ions_of_file, self._later)
                 self.spectrum.shown.append(self.correlation.put)
         if explorer.is_comparison:
-            emission = self.emission
             self.registration = RegistrationPanel(
-                explorer, lambda: emission.perturbation, registration_of, request, note, self._later, self.summary.judge
+                explorer,
+                lambda: self.settings().perturbation,
+                registration_of,
+                request,
+                note,
+                self._later,
+                self.summary.judge,
             )
             self._panels.append(self.registration)
-        emission, spectrum = self.emission, self.spectrum
+        spectrum = self.spectrum
         self.reconstruction = ReconstructionPanel(
-            explorer, (lambda: emission.perturbation) if emission is not None else None,
+            explorer, lambda: self.settings().perturbation,
             (lambda: spectrum.named) if spectrum is not None else None, self._material, self._later,
         )  # fmt: skip
         self.tools = MouseTools(figures, tools, self.figures.show_whole)

@@ -52,7 +52,7 @@ class ReconstructionPanel:
     ----------
     explorer : Explorer
         The run, whose ions are reconstructed if there is one, or the measured ions.
-    perturbation : callable or None
+    perturbation : callable
         Returns the emission of the ions of the run.
     spectrum : callable or None
         Returns the spectrum of the measured ions, whose ranges give their species.
@@ -65,7 +65,7 @@ class ReconstructionPanel:
     def __init__(
         self,
         explorer: Explorer,
-        perturbation: Callable[[], Perturbation] | None,
+        perturbation: Callable[[], Perturbation],
         spectrum: Callable[[], Spectrum | None] | None,
         material: Callable[[], str],
         later: Callable[[Callable[[], None], int], Any],
@@ -161,7 +161,6 @@ class ReconstructionPanel:
         except ValueError:  # not in real units
             run = run.at_evaporation_field()
             constants = run_constants(run)
-        assert self._perturbation is not None
         return run.hits(self._perturbation()), constants, None
 
     def _of_measured(self, typed):

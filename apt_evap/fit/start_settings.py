@@ -388,7 +388,7 @@ def _of_metal(material):
     return [
         "",
         "[[maps.panels]]",
-        'title = "rule of the metal"',
+        'title = "roll-up predicted for the metal"',
         "# its numbers were selected with maps of W, Ni and Al, none with this map. Atoms roll up if the charge of a "
         f"neighbour over theirs is above {middle:.2f};",
         f"# for an evaporation field that is a tenth higher or lower, above {low:.2f} or {high:.2f}, which may decide "

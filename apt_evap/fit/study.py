@@ -30,6 +30,8 @@ LEAST_CEILING = 0.1
 noise by noise."""
 RULE_OF_METAL = "rule of the metal"
 """Baseline of `RollUp.of_metal`, for which nothing is fitted to the map."""
+PREDICTED = "roll-up predicted for the metal"
+"""The same in texts."""
 ABOVE_NOISE = 2.0
 """Standard deviations above 0 of an uncorrected score that is corrected for noise."""
 
@@ -227,7 +229,7 @@ class Study:
         text = f"{self.settings.score_name} {best}, unperturbed {unperturbed}"
         if RULE_OF_METAL in self.baselines:
             rule = (self.baselines if corrected else self.plain)[RULE_OF_METAL]
-            text += f", {RULE_OF_METAL} (not fitted) {rule}"
+            text += f", {PREDICTED} (not fitted) {rule}"
         if corrected:
             text += f"; uncorrected for noise {self.plain['optimum']}"
         elif self.settings.allow_noise:

@@ -543,9 +543,7 @@ def test_a_run_keeps_the_selected_ions(run, measured):
 
 
 def test_what_is_refused(run, measured):
-    bare = replace(run, responses=None)
     for arguments, sentence in [
-        ((bare,), "run must have responses"),
         ((run, None, TURNED), "registration needs"),
         ((None, measured, TURNED), "registration needs"),
         ((), "run, measured"),
@@ -593,6 +591,16 @@ def test_maps_follow_every_option(small_tip):
         perturbation = ae.RollUp(ENERGY, **options)
         expected = run[:].hits(perturbation)  # a new run, which knows nothing of the previous ones
         assert np.array_equal(explorer.hits(ExplorerSettings(perturbation, 24, 0.0)).x, expected.x, equal_nan=True)
+
+
+def test_a_run_without_responses_shows_the_emission_that_was_flown(small_tip, measured):
+    emission = ae.LateralVelocity(0.1)
+    run = ae.Simulation(small_tip, seed=2, **ROUGH).run(300, [emission], responses=False, progress=False)
+    explorer = Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)))
+    assert not explorer.has_sliders and explorer.start.perturbation == emission
+    maps = explorer.show(replace(explorer.start, bins=24))
+    expected = run.hits(emission).map(like=explorer.bins_like(24), position_step=None)
+    assert np.array_equal(maps.simulated.values, expected.values)
 
 
 def test_perturbations_without_controls():

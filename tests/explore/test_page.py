@@ -729,7 +729,7 @@ def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
     hits = ae.Hits(x=x, y=y, voltage=volts, time_of_flight=time, pulse_id=np.arange(n) // 2)
     opened = Opened(Explorer(None, hits, file=MeasuredFile("ions.epos", distance=92.0)))
     page, panel = opened.page, opened.page.spectrum
-    opened.settle(lambda: panel.text.text != 'naming the peaks' and panel._pending is None)
+    opened.settle(lambda: panel.text.text != "naming the peaks" and panel._pending is None)
     assert panel.named is not None, panel.text.text
     fitted = page.explorer.ions_of_file.flight
     assert panel.distance.value == page.explorer.distance == 92.0 and fitted[0] == pytest.approx(90.0, abs=0.5)

@@ -11,7 +11,7 @@ from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
 from apt_evap.analysis.description import lens_text
-from apt_evap.fit.study import RULE_OF_METAL, Score, Study
+from apt_evap.fit.study import PREDICTED, RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.directions import plain_label
 from apt_evap.plot.report.html_page import (
     Page,
@@ -186,7 +186,7 @@ def _scores(study):
     )
     scores = {**study.baselines, "optimum": study.optimum.score}
     thermal = f"thermal, {study.settings.temperature:g} K"
-    labels = {"thermal": thermal, RULE_OF_METAL: f"{RULE_OF_METAL}, not fitted", "optimum": "best"}
+    labels = {"thermal": thermal, RULE_OF_METAL: f"{PREDICTED}, not fitted", "optimum": "best"}
     rows = [(labels.get(name, name), score, study.plain[name]) for name, score in scores.items()]
     head = ["Map", corrected, f"uncorrected {study.settings.score_name}"]
     if not study.settings.allow_noise:
