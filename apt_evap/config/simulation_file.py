@@ -23,7 +23,7 @@ from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import field_of_view
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.evaporation.cap import FEWEST, HALF_ANGLE
+from apt_evap.evaporation.cap import doubt_of_cap
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
@@ -232,11 +232,10 @@ class Config:
         if self.real_units is None and self.microscope is None:
             return
         reference = (self.real_units or OperatingPoint()).field_reference
-        if reference == "cap" and math.isnan(simulation.emitter.cap.ratio):
-            raise ValueError(
-                f'field_reference = "cap" needs at least {FEWEST} evaporable atoms within {HALF_ANGLE:g} degrees of '
-                'the axis, the tip has fewer: use a larger apex_radius, or field_reference = "site"'
-            )
+        if reference == "cap":
+            doubt = doubt_of_cap(simulation.emitter.cap.radius, simulation.tip.settings.get("apex_radius"))
+            if doubt:
+                raise ValueError(doubt)
 
     def with_origin(self, run: Run) -> Run:
         """The run with the name of this file, its maps and its key in the provenance."""

@@ -12,6 +12,11 @@ from apt_evap._core.elementary import sine_and_cosine, total
 
 HALF_ANGLE = 45.0  # degrees from the axis: about what an instrument sees, and far from the shank
 FEWEST = 12  # surface atoms: three times the unknowns of the sphere
+# Of the apex radius, for a tip before its first event: the rounds shrink towards a facet otherwise. Chosen with Be,
+# Mg and Ti [0001] and [10-10] of 6 to 10 a: 0.34 to 0.59 where the atoms deviate from the sphere by more than 0.07 R
+# (rms), 0.71 to 0.91 elsewhere. Judged with Ni, W, Ru and Si of 3 to 10 a: 0.48 with 0.088 R, 0.61 to 0.98 with 0.077
+# R and less.
+LEAST_RADIUS = 0.6
 _ROUNDS = 3  # the selection of atoms depends on the centre; it changed by less than 1e-3 R after the second round
 
 
@@ -79,3 +84,30 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     weights = fields / total(fields)  # fields are proportional to charges
     ratio = total(weights * fields / evaporation_fields[chosen])
     return Cap(total(weights * fields), ratio, radius, float(centre[2]) + radius)
+
+
+def doubt_of_cap(radius: float, apex_radius: float | None) -> str:
+    """What is wrong with the cap of a tip before its first event, "" if nothing is.
+
+    Parameters
+    ----------
+    radius : float
+        That of the cap [nm]; NaN if there is none.
+    apex_radius : float or None
+        That of the tip [nm], if it is known.
+
+    Returns
+    -------
+    str
+    """
+    if math.isnan(radius):
+        return (
+            f'field_reference = "cap" needs at least {FEWEST} evaporable atoms within {HALF_ANGLE:g} degrees of the '
+            'axis, the tip has fewer: use a larger apex_radius, or field_reference = "site"'
+        )
+    if apex_radius is not None and radius < LEAST_RADIUS * apex_radius:
+        return (
+            f'field_reference = "cap" needs a cap of at least {LEAST_RADIUS:g} of the apex_radius {apex_radius:.3g} '
+            f'nm, got {radius:.3g} nm, on a facet: use a larger apex_radius, or field_reference = "site"'
+        )
+    return ""

@@ -19,6 +19,7 @@ from apt_evap._core.elementary import logarithm, total
 from apt_evap.detection.microscope.free_specimen import FreeSpecimen
 from apt_evap.detection.timing import Timing
 from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, PostIonisation
+from apt_evap.evaporation.cap import doubt_of_cap
 from apt_evap.evaporation.voltage import VoltageControl
 from apt_evap.simulation.history import CapHistory
 from apt_evap.specimen.isotopes import draw_isotopes
@@ -336,6 +337,10 @@ def real_units_of(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColum
         control = from_plain(stored, VoltageControl) if stored else VoltageControl()
     seed = run.seed if point.seed is None else point.seed
     given_charges = check_flight_charges(point.flight_charges, run.elements)
+    if point.field_reference == "cap" and len(run.cap.ions) and run.cap.ions[0] == 0:
+        radius = float(run.cap.radii[0])  # of the tip before its first event; without one, later caps are used
+        if np.isfinite(radius) and (doubt := doubt_of_cap(radius, tip.get("apex_radius"))):
+            raise ValueError(doubt)
     host_field = (tip["material"] if "material" in tip else tip["elements"][0])["evaporation_field"]
     voltages, goal, field_ratio = real_voltages(
         run.fields / evaporation_fields,

@@ -45,5 +45,21 @@ def test_a_tip_without_a_cap_is_refused_before_the_simulation(tmp_path):
     path.write_text(TIP.format("cap"))
     with pytest.raises(ae.FileError, match=r"t\.toml', \[real_units\]: field_reference = .cap. needs at least 12"):
         read_config(path).simulation(n_threads=1)
+    path.write_text(TIP.format("cap").replace('"Ti"', '"Mg"'))
+    with pytest.raises(
+        ae.FileError, match=r"cap of at least 0\.6 of the apex_radius 1\.93 nm, got 0\.65 nm, on a facet"
+    ):
+        read_config(path).simulation(n_threads=1)
+    path.write_text(TIP.format("cap").replace('"6 a"', '"7 a"').replace('"Ti"', '"Mg"'))
+    read_config(path).simulation(n_threads=1)
     path.write_text(TIP.format("site"))
     read_config(path).simulation(n_threads=1)
+
+
+def test_a_run_of_a_tip_whose_cap_is_on_a_facet_has_no_real_units():
+    metal = ae.material("Mg")
+    tip = ae.Tip(metal, apex_radius=6 * metal.a, axis=(0, 0, 1), shank_length=6 * metal.a, shank_angle=1.5)
+    run = ae.Simulation(tip, seed=1, n_threads=1).run(5, responses=False, progress=False)
+    with pytest.raises(ValueError, match=r"apex_radius 1\.93 nm, got 0\.65 nm, on a facet: use a larger apex_radius"):
+        run.at_evaporation_field(field_reference="cap")
+    assert run.at_evaporation_field(field_reference="site").voltage > 0
