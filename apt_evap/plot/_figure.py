@@ -4,8 +4,10 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from functools import partial, wraps
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import matplotlib
 import numpy as np
@@ -16,6 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 if TYPE_CHECKING:
 
@@ -29,6 +34,43 @@ else:
 
 if os.environ.get("APT_EVAP_DEFAULT_STYLE"):  # of a command: the settings of the user may need LaTeX
     matplotlib.rcdefaults()
+
+# settings that are no style: backends and windows
+_NO_STYLE = ("backend", "interactive", "toolbar", "timezone", "webagg", "tk.", "savefig.directory", "date.epoch")
+_NO_STYLE += ("figure.raise_window", "figure.max_open_warning", "figure.hooks")
+
+
+def _of_matplotlibrc():
+    """Settings that the matplotlibrc of the user has changed."""
+    default, original = matplotlib.rcParamsDefault, matplotlib.rcParamsOrig
+    names = (name for name in original if not name.startswith(_NO_STYLE))
+    return {name: original[name] for name in names if original[name] != default.get(name)}
+
+
+_CHANGED = _of_matplotlibrc()
+
+
+def default_settings() -> Any:
+    """Context of the default settings of matplotlib, whatever the matplotlibrc of the user: it may need LaTeX.
+
+    What a program has set since, such as a style, stays.
+    """
+    here = {name: value for name, value in _CHANGED.items() if matplotlib.rcParams[name] == value}
+    if not here:
+        return nullcontext()
+    return matplotlib.rc_context({name: matplotlib.rcParamsDefault[name] for name in here})
+
+
+def with_default_settings(function: Callable[P, T]) -> Callable[P, T]:
+    """The function, which draws in the context of `default_settings`."""
+
+    @wraps(function)
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> T:
+        with default_settings():
+            return function(*args, **kwargs)
+
+    return drawn
+
 
 OUTSIDE = "0.88"
 """Colour outside the detector."""
@@ -122,6 +164,19 @@ class _Layout(ConstrainedLayoutEngine):
             super().execute(fig)
 
 
+class _Figure(Figure):
+    """A figure that is drawn and saved with the settings that it was made with: ticks are made when it is drawn."""
+
+    def draw(self, renderer: Any) -> None:
+        with default_settings():
+            super().draw(renderer)
+
+    def savefig(self, *args: Any, **kwargs: Any) -> None:
+        with default_settings():
+            super().savefig(*args, **kwargs)
+
+
+@with_default_settings
 def new_figure(size: tuple[float, float]) -> Figure:
     """Make a figure of (width, height) `size` [inch].
 
@@ -140,5 +195,5 @@ def new_figure(size: tuple[float, float]) -> Figure:
     if "ipykernel" in sys.modules:
         importlib.import_module("matplotlib.pyplot")  # with the backend that displays figures below their cells
     pyplot = sys.modules.get("matplotlib.pyplot")
-    make = Figure if pyplot is None else pyplot.figure
+    make = _Figure if pyplot is None else partial(pyplot.figure, FigureClass=_Figure)
     return make(figsize=size, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06), dpi=150)

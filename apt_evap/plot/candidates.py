@@ -7,13 +7,14 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_count, check_kind
 from apt_evap.maps.indexing.index_map import SHOWN, Indexing
-from apt_evap.plot._figure import new_figure
+from apt_evap.plot._figure import new_figure, with_default_settings
 from apt_evap.plot.map_figures import color_limits, detector_map
 from apt_evap.plot.pole_labels import poles
 
 _CHARACTERS = 12  # of a title, per inch
 
 
+@with_default_settings
 def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.object_]:
     """Draw a map with the poles and zone lines of its candidates, each beside its predicted pattern.
 

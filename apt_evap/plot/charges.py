@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_choice, check_kind
 from apt_evap.analysis.charge_states import ChargeStateMap
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, ion_label, new_figure, set_caption, set_log_ticks, set_title
+from apt_evap.plot._figure import (
+    OUTSIDE,
+    add_colorbar,
+    ion_label,
+    new_figure,
+    set_caption,
+    set_log_ticks,
+    set_title,
+    with_default_settings,
+)
 from apt_evap.plot.map_figures import describe
 
 _LEAST_RANGE = {
@@ -18,6 +27,7 @@ _LEAST_RANGE = {
 }  # high over low end of a scale, to which noise would otherwise be stretched
 
 
+@with_default_settings
 def charge_states(
     simulated: ChargeStateMap,
     measured: ChargeStateMap | None = None,

@@ -8,10 +8,11 @@ from matplotlib.colors import LogNorm
 
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.correlation import Correlation, dissociation_line
-from apt_evap.plot._figure import DrawnAxes, new_figure
+from apt_evap.plot._figure import DrawnAxes, new_figure, with_default_settings
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 
+@with_default_settings
 def correlation(
     pairs: Correlation,
     spectrum: Spectrum | None = None,

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap.maps.folded_map import FoldedMap
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, with_default_settings
 
 
+@with_default_settings
 def folded_maps(maps: Mapping[str, FoldedMap], *, colormap: str = "inferno") -> NDArray[np.object_]:
     """Draw folded maps side by side, with a common colour scale.
 

@@ -10,7 +10,7 @@ from apt_evap._common.validation import check_choice, check_count, check_kind
 from apt_evap.analysis.charge_states import LEAST, charge_history, ion_charges
 from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import ion_label, new_figure, set_log_ticks
+from apt_evap.plot._figure import ion_label, new_figure, set_log_ticks, with_default_settings
 from apt_evap.simulation.run import Run
 from apt_evap.spectra.mass_ranges import Ranges
 
@@ -18,6 +18,7 @@ _PER_SECTION = 100  # ions of a section in which they are counted: an error of 1
 _LEAST_RANGE = 4.0  # of a logarithmic axis, highest over lowest value
 
 
+@with_default_settings
 def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int = 200) -> NDArray[np.object_]:
     """Draw field and voltage of the evaporation of a run, or the voltage of a measurement, against the ions.
 
@@ -58,6 +59,7 @@ def history(run: Run | Hits, axes: Sequence[Axes] | None = None, *, points: int 
     return axes
 
 
+@with_default_settings
 def voltage_curve(
     run: Run | Hits,
     axes: Sequence[Axes] | None = None,

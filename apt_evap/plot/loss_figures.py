@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_choice, check_kind
 from apt_evap.evaporation.losses import Conditions
-from apt_evap.plot._figure import new_figure
+from apt_evap.plot._figure import new_figure, with_default_settings
 
 _LEVELS = (1e-4, 1e-3, 1e-2, 1e-1)  # of the lost share
 _LEAST_BIAS = 0.01  # of the colour scale, in units of the true fraction
 
 
+@with_default_settings
 def conditions(
     result: Conditions, element: str | None = None, axes: Sequence[Axes] | None = None
 ) -> NDArray[np.object_]:

@@ -15,7 +15,15 @@ from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.maps.crystallography.directions import label as plane_label
-from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
+from apt_evap.plot._figure import (
+    OUTSIDE,
+    DrawnAxes,
+    add_colorbar,
+    new_figure,
+    set_caption,
+    set_title,
+    with_default_settings,
+)
 from apt_evap.simulation.run import Run
 
 RIM = "0.45"
@@ -24,6 +32,7 @@ _ROUND = 0.03
 """Largest part of the area of a field of view that is not common with a circle, for it to be drawn as one."""
 
 
+@with_default_settings
 def detector_map(
     map: DetectorMap | Hits,
     ax: Axes | None = None,
@@ -82,6 +91,7 @@ def detector_map(
     return ax
 
 
+@with_default_settings
 def detector_maps(
     maps: Sequence[DetectorMap | Hits],
     titles: Sequence[str] | None = None,

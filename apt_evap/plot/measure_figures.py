@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_choice, check_kind, check_sequence
 from apt_evap.measures.interface import CompositionProfile
 from apt_evap.measures.point_cloud import Clusters
-from apt_evap.plot._figure import DrawnAxes, new_figure, set_title
+from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default_settings
 from apt_evap.reconstruction.truth_comparison import TruthComparison
 
 _DOTS = 20_000  # solutes from the side: more hide each other
 _FEWEST = 3  # solutes with a distribution of distances
 
 
+@with_default_settings
 def clusters(result: Clusters, *, title: str | None = None) -> NDArray[np.object_]:
     """Draw clusters: solutes from the side, nearest neighbours, the choice of the separation, compositions.
 
@@ -56,6 +57,7 @@ def clusters(result: Clusters, *, title: str | None = None) -> NDArray[np.object
     return axes
 
 
+@with_default_settings
 def composition_profile(
     profile: CompositionProfile,
     elements: str | Sequence[str] | None = None,
@@ -99,6 +101,7 @@ def composition_profile(
     return ax
 
 
+@with_default_settings
 def truth_comparison(result: TruthComparison, *, title: str | None = None) -> NDArray[np.object_]:
     """Draw each measure of all sites, of the detected ions and of their reconstructions side by side.
 

@@ -9,7 +9,15 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.maps.registration.correlation_search import BROAD, View
 from apt_evap.maps.registration.register import Registration, ScoreSurface
-from apt_evap.plot._figure import OUTSIDE, DrawnAxes, add_colorbar, new_figure, set_caption, set_title
+from apt_evap.plot._figure import (
+    OUTSIDE,
+    DrawnAxes,
+    add_colorbar,
+    new_figure,
+    set_caption,
+    set_title,
+    with_default_settings,
+)
 from apt_evap.plot.map_figures import detector_map
 
 BRIGHT, DARK, RIM = "cyan", "lime", "white"
@@ -17,6 +25,7 @@ _SMOOTHING = 0.015
 """Smoothing of the contours [diameters of the measured field of view]."""
 
 
+@with_default_settings
 def overlay(
     simulated: DetectorMap | Hits,
     measured: DetectorMap | Hits,
@@ -107,6 +116,7 @@ def _caption(registration):
     return f"{registration}\n{quality}"
 
 
+@with_default_settings
 def score_surface(surface: ScoreSurface, ax: Axes | None = None) -> Axes:
     """Draw the score of a registration against rotation and scale, with its maximum.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_number
 from apt_evap.detection.color_limits import common_limits
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.plot._figure import add_colorbar, new_figure
+from apt_evap.plot._figure import add_colorbar, new_figure, with_default_settings
 from apt_evap.plot.map_figures import detector_map
 
 _INCH = 25.4  # mm
@@ -25,6 +25,7 @@ WIDTHS = 20.0, 400.0
 """Narrowest and widest figure [mm]."""
 
 
+@with_default_settings
 def paper_maps(
     maps: Sequence[DetectorMap], width: float = 85.0, *, colormap: str = "inferno", label: str = "hits per area / mean"
 ) -> NDArray[np.object_]:
@@ -85,6 +86,7 @@ def paper_maps(
     return axes
 
 
+@with_default_settings
 def add_scale_bar(ax: Axes) -> float:
     """Draw a scale bar in the lower left corner of a map.
 

@@ -14,7 +14,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.directions import poles as poles_of
 from apt_evap.maps.crystallography.directions import zones
 from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation
-from apt_evap.plot._figure import DrawnAxes
+from apt_evap.plot._figure import DrawnAxes, with_default_settings
 from apt_evap.simulation.run import Run
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
@@ -22,6 +22,7 @@ _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
 _APART = 30  # smallest distance between labels [points], at font size 9
 
 
+@with_default_settings
 def poles(
     ax: Axes,
     orientation: Orientation | FittedOrientation | Run,

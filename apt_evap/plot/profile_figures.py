@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from apt_evap.maps.profiles import Profile, Rectangle, compare_profiles
 from apt_evap.maps.zone_line import ZoneLine
-from apt_evap.plot._figure import DrawnAxes, new_figure
+from apt_evap.plot._figure import DrawnAxes, new_figure, with_default_settings
 
 
+@with_default_settings
 def profile(
     profiles: Profile | Sequence[Profile],
     labels: Sequence[str] | None = None,
@@ -74,6 +75,7 @@ def profile(
     return ax
 
 
+@with_default_settings
 def profile_comparison(
     first: Profile,
     second: Profile,
@@ -125,6 +127,7 @@ def profile_comparison(
     return np.array([upper, lower])
 
 
+@with_default_settings
 def rectangles(
     chosen: Rectangle | Sequence[Rectangle], ax: Axes, *, colors: Any = "cyan", labels: Sequence[str] | None = None
 ) -> DrawnAxes:

@@ -10,7 +10,7 @@ from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import add_colorbar, new_figure, set_title
+from apt_evap.plot._figure import add_colorbar, new_figure, set_title, with_default_settings
 from apt_evap.plot.map_figures import binned
 from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges
@@ -25,6 +25,7 @@ _CORE = 0.5  # of the field of view, in which profiles are counted
 OUTSIDE = "outside every range"
 
 
+@with_default_settings
 def reconstruction(
     result: Reconstruction, ranges: Ranges | None = None, *, title: str | None = None
 ) -> NDArray[np.object_]:

@@ -12,7 +12,7 @@ from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
 from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
-from apt_evap.plot._figure import DrawnAxes, new_figure, set_title
+from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default_settings
 from apt_evap.simulation.run import Run
 
 MECHANISMS = ("lateral velocity", "roll-up")
@@ -33,6 +33,7 @@ def ion_colors(n: int) -> list[str]:
     return [f"C{index % 10}" for index in range(n)]
 
 
+@with_default_settings
 def response(
     run: Run,
     ions: ArrayLike,

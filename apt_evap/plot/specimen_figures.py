@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
 from apt_evap.evaporation.emitter import Emitter
-from apt_evap.plot._figure import DrawnAxes, add_colorbar, new_figure, set_title
+from apt_evap.plot._figure import DrawnAxes, add_colorbar, new_figure, set_title, with_default_settings
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.tip import Tip
 
@@ -23,6 +23,7 @@ _VOLTAGE = 1000.0  # [V] of a tip without a simulation
 COLORED_BY = {"fields": "field [V/nm]", "charges": "charge [e]"}
 
 
+@with_default_settings
 def specimen(
     emitter: Emitter | Simulation | Tip,
     color: str | ArrayLike = "fields",
@@ -128,6 +129,7 @@ def _discs(ax, places, diameter, **colors):
     return discs
 
 
+@with_default_settings
 def cut(
     tip: Tip,
     color: str = "phase",
@@ -237,6 +239,7 @@ def _direction(vector):
     return "along (" + ", ".join(f"{component:.2g}" for component in vector) + ")"
 
 
+@with_default_settings
 def mark_atoms(
     positions: ArrayLike,
     ax: Axes,

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge
+from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge, with_default_settings
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
 from apt_evap.spectra.mass_ranges import Ranges
@@ -26,6 +26,7 @@ _LOW = 1.5  # a peak is too low for a label if another one behind the label is t
 _HIGHEST_CHARGE = 4
 
 
+@with_default_settings
 def spectrum(
     ions: Run | Hits | Spectrum | Sequence[Run | Hits],
     labels: Sequence[str] | None = None,

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.detection.color_limits import common_limits
 from apt_evap.fit.study import Study
-from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure
+from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, with_default_settings
 from apt_evap.plot.map_figures import detector_map
 
 _MARK = "#00d0ff"  # visible on all colours of both maps
 
 
+@with_default_settings
 def score_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: str = "viridis") -> NDArray[np.object_]:
     """Draw the score with the measured map against mean and relative standard deviation of the energy.
 
@@ -112,6 +113,7 @@ def _mark_optima(study, axes):
     )
 
 
+@with_default_settings
 def side_by_side(
     study: Study,
     *,

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_kind
-from apt_evap.plot._figure import add_colorbar, new_figure, set_title
+from apt_evap.plot._figure import add_colorbar, new_figure, set_title, with_default_settings
 from apt_evap.plot.reconstructions import FEWEST, species_of
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
 from apt_evap.spectra.mass_ranges import Ranges
@@ -17,6 +17,7 @@ _COLORS = ("0.75", "C3", "C0", "C2", "C4", "C5", "C6", "0.4")  # the matrix is g
 _DOTS = 12_000
 
 
+@with_default_settings
 def surface_history(
     result: EvolvingReconstruction, ranges: Ranges | None = None, *, title: str | None = None
 ) -> NDArray[np.object_]:
