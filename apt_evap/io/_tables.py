@@ -6,7 +6,9 @@ with # are comments; one just before the numbers may have the names.
 
 import csv
 import re
+from collections import Counter
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ from apt_evap._common.types import AnyPath, Floats
 from apt_evap.io._texts import read_text
 
 _NUMBER = re.compile(r"[-+]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][-+]?[0-9]+)?|nan|[-+]?inf(inity)?", re.IGNORECASE)
+
+_SAMPLE = 200  # lines that show what divides the columns, and how many there are
 
 
 def _is_number(cell):
@@ -34,7 +38,7 @@ class Table:
     numbers: list[int]
     """Number of the line of each row."""
     rows: list[list[str]] = field(repr=False)
-    """Cells of each row, as many as the first row has."""
+    """Cells of each row, as many as most rows have."""
 
     def floats(self, column: int, what: str = "a number") -> Floats:
         """Numbers of a column, NaN for an empty cell; a FileError names the line of a cell that is something else."""
@@ -75,7 +79,7 @@ def read_table(path: AnyPath, what: str, at_most: int) -> Table:
     Raises
     ------
     FileError
-        If the file cannot be read, has no row of numbers, or a line has more or fewer cells than the first one.
+        If the file cannot be read, has no row of numbers, or a line has more or fewer cells than the others.
     """
     text = read_text(path, what, at_most)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip(" ;,\t")]
@@ -83,35 +87,44 @@ def read_table(path: AnyPath, what: str, at_most: int) -> Table:
     lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
     if not lines:
         raise FileError(f"{str(path)!r} has no numbers, expected {what}")
-    divider = _divider(lines[-1][1])
+    divider = _divider([line for _, line in lines[:_SAMPLE]])
     cells = _cells([line for _, line in lines], divider)
     numbers = [number for number, _ in lines]
+    if len(cells) != len(numbers):
+        first = next(number for number, line in lines if line.count('"') % 2)
+        raise FileError(f"{str(path)!r}, line {first}: expected a second quote")
     names: list[str] = []
     comment: list[str] = []
-    if not any(cell and _is_number(cell) for cell in cells[0]):
-        names, cells, numbers = cells[0], cells[1:], numbers[1:]
+    width = max(Counter(map(len, cells[:_SAMPLE])).items(), key=itemgetter(1))[0]  # that of most lines
+    has_names = not any(cell and _is_number(cell) for cell in cells[0])
+    if has_names:
+        names = cells[0]
     elif comments:
         words = _cells(comments[-1:], divider if divider and divider in comments[-1] else None)[0]
-        comment = [word.strip(",;") for word in words[: len(cells[0])]]
-    if not cells:
+        comment = [word.strip(",;") for word in words[:width]]
+    if not cells[has_names:]:
         raise FileError(f"{str(path)!r} has no numbers, expected {what}")
-    width = len(names) if names and len(names) > len(cells[0]) else len(cells[0])
     for number, row in zip(numbers, cells, strict=True):
         if len(row) != width:
             raise FileError(f"{str(path)!r}, line {number}: expected {width} cells, got {len(row)}")
+    cells, numbers = cells[has_names:], numbers[has_names:]
     if divider != ",":
         cells = [[cell.replace(",", ".") if _is_number(cell) else cell for cell in row] for row in cells]
     return Table(str(path), names, comment, numbers, cells)
 
 
-def _divider(line):
-    """What divides the cells of a line: a semicolon, a tab, a comma, or None for spaces; none of those in quotes."""
-    line = re.sub(r'"[^"]*"', '""', line)
-    for divider in ";\t":
-        if divider in line:
-            return divider
-    decimal = all(map(_is_number, line.split())) and len(line.split()) > 1  # "1,204 -3,377"
-    return "," if "," in line and not decimal else None
+def _divider(lines):
+    """What divides the cells of most lines, but in quotes: a semicolon, a tab, a comma, or None for spaces."""
+    lines = [re.sub(r'"[^"]*"', '""', line) for line in lines]
+    for divider in ";\t,":
+        divided = [line for line in lines if divider in line]
+        if 2 * len(divided) > len(lines):
+            break
+    else:
+        return None
+    # "1,204 -3,377": decimal commas
+    decimal = [len(line.split()) > 1 and all(map(_is_number, line.split())) for line in divided]
+    return None if divider == "," and 2 * sum(decimal) >= len(divided) else divider
 
 
 def _cells(lines, divider):

@@ -5,9 +5,11 @@ from the file (a column ``element``, or type labels) or from the user.
 """
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
+from operator import itemgetter
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from apt_evap._common.validation import check_choice, short_text
 from apt_evap.io._texts import ELEMENTS, read_text
 
 _MAX_BYTES = 1 << 32
+_SAMPLE = 200  # rows that show how many columns there are
 _NM = {"metal": 0.1, "real": 0.1, "electron": 0.052917721, "nano": 1.0, "micro": 1e3, "cgs": 1e7, "si": 1e9}
 """Length unit of each style of units [nm]; electron: the Bohr radius (CODATA 2022)."""
 # columns before x in the section Atoms: those of the type, and all of them
@@ -117,6 +120,7 @@ def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
         where,
         lines,
         first + 1,
+        len(columns),
     )
     flags = np.zeros((n, 3))
     flags[:, ["xyz".index(name[1]) for name in images]] = _whole(values[:, 3:], where)
@@ -226,7 +230,7 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
         raise FileError(f"{where} states {n} atoms but contains {len(rows)} in its section Atoms")
     if style is not None:
         check_choice(style, "style", _STYLES)
-    width = len(rows[0].split())
+    width = _usual_width(rows)
     hint = comment.split()[:1]
     if style is None and hint:
         style = hint[0] if hint[0] in _STYLES else ""
@@ -240,7 +244,7 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
     of_type, first = _STYLES[style]
     if width not in (first + 3, first + 6):
         raise FileError(f"{where}: the style {style} has {first + 3} columns or {first + 6}, got {width}")
-    (types,), values = atom_table(rows, [of_type], range(first, width), where, lines, at + 1)
+    (types,), values = atom_table(rows, [of_type], range(first, width), where, lines, at + 1, width)
     positions = values[:, :3]
     if width == first + 6 and (flags := _whole(values[:, 3:], where)).any():
         positions = positions + flags @ _box_of_data(lines[: min(at for at, _ in sections.values())], where)
@@ -272,35 +276,47 @@ def _names_of_masses(lines, at):
 
 
 def atom_table(
-    rows: Sequence[str], of_texts: Sequence[int], of_numbers: Sequence[int], where: str, lines: Sequence[str], at: int
+    rows: Sequence[str],
+    of_texts: Sequence[int],
+    of_numbers: Sequence[int],
+    where: str,
+    lines: Sequence[str],
+    at: int,
+    width: int | None = None,
 ) -> tuple[list[list[str]], Floats]:
     """Columns of the rows of the atoms with these numbers: lists of texts, and finite numbers, shape (n, k).
 
-    The rows are in `lines` of the file from `at`: an error names the line.
+    The rows are in `lines` of the file from `at`: an error names the line. All have `width` columns; None: enough.
     """
+    least = max(*of_texts, *of_numbers) + 1
+    widths = range(least, 1 << 20) if width is None else range(width, width + 1)
     try:
-        if not all(row.strip() for row in rows):  # NumPy leaves out empty rows, with a warning
-            raise ValueError("an empty row")
+        if any(len(row.split()) not in widths for row in rows):
+            raise ValueError("a row of another width")
         texts = np.loadtxt(rows, str, comments=None, usecols=tuple(of_texts), ndmin=2).T.tolist()
         numbers = np.loadtxt(rows, float, comments=None, usecols=tuple(of_numbers), ndmin=2)
         good = bool(np.isfinite(numbers).all())
     except ValueError:
         good = False
     if not good:
-        least = max(*of_texts, *of_numbers) + 1
-        row = next(row for row in rows if not _is_atom(row.split(), least, of_numbers))
+        row = next(row for row in rows if not _is_atom(row.split(), widths, of_numbers))
         line = next(k for k in range(at, len(lines)) if row in (lines[k], lines[k].partition("#")[0].strip()))
         raise FileError(
-            f"{where}, line {line + 1}: expected {least} columns or more with finite coordinates of an atom, got "
+            f"{where}, line {line + 1}: expected {widths[0]} columns with finite coordinates of an atom, got "
             f"{short_text(row)}"
         )
     return texts, numbers
 
 
-def _is_atom(cells, least, of_numbers):
-    """Whether a row has these columns, and finite numbers in some of them."""
+def _usual_width(rows):
+    """Number of columns of most of the first rows."""
+    return max(Counter(len(row.split()) for row in rows[:_SAMPLE]).items(), key=itemgetter(1))[0]
+
+
+def _is_atom(cells, widths, of_numbers):
+    """Whether a row has as many columns, and finite numbers in some of them."""
     try:
-        return len(cells) >= least and all(np.isfinite(float(cells[k])) for k in of_numbers)
+        return len(cells) in widths and all(np.isfinite(float(cells[k])) for k in of_numbers)
     except ValueError:
         return False
 

@@ -127,9 +127,9 @@ def test_types_without_a_name_are_refused(save):
         ("ITEM: ATOMS", "ITEM: THINGS", "no line ITEM: ATOMS"),
         ("type x y z", "type x y", "no columns x y z"),
         ("id type x", "id kind x", "no column type, typelabel or element"),
-        ("\n2 1 ", "\n2 1 red ", "line 11: expected 5 columns or more with finite coordinates of an atom, got '2 1 r"),
-        ("\n2 1 ", "\n2 1 nan ", "line 11: expected 5 columns or more with finite coordinates of an atom, got '2 1 n"),
-        ("\n2 1 ", "\n\n2 1 ", "line 11: expected 5 columns or more with finite coordinates of an atom, got ''"),
+        ("\n2 1 ", "\n2 1 red ", "line 11: expected 5 columns with finite coordinates of an atom, got '2 1 r"),
+        ("\n2 1 ", "\n2 1 nan ", "line 11: expected 5 columns with finite coordinates of an atom, got '2 1 n"),
+        ("\n2 1 ", "\n\n2 1 ", "line 11: expected 5 columns with finite coordinates of an atom, got ''"),
     ],
 )
 def test_dumps_that_are_wrong(save, old, new, message):
@@ -388,7 +388,7 @@ def test_xyz_with_any_names_of_types(save):
         (xyz(symbols).replace("12", "13", 1), "states 13 atoms but contains 12"),
         (xyz(symbols, comment="Properties=species:S:1:force:R:3"), "expected columns species and pos of each atom"),
         (xyz(symbols, comment="Properties=species:S:x"), "expected Properties=species:S:1:pos:R:3"),
-        (xyz(symbols).replace("Cu", "Cu x", 1), "line 11: expected 4 columns or more with finite coordinates"),
+        (xyz(symbols).replace("Cu", "Cu x", 1), "line 11: expected 4 columns with finite coordinates"),
         (xyz(["AL"] * 8 + ["Cu"] * 4), r"no chemical symbols: name their elements, such as types=\{'AL': 'Al'\}"),
     ):
         with pytest.raises(FileError, match=rf"a\.xyz'.*{message}"):
@@ -473,3 +473,27 @@ def test_partial_occupancy_is_warned_of(save, share):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ae.read_tip(save(ordered, "b.cif"))
+
+
+@pytest.mark.parametrize(
+    ("text", "first"), [(lammps_dump(PLACES, TYPES), 10), (lammps_data(PLACES, TYPES), None), (xyz(["Al"] * 12), 3)]
+)
+def test_one_odd_row_is_named(save, text, first):
+    """Before, a number or a word too many moved the coordinates of an atom by a column, without a word."""
+    name = "a.xyz" if first == 3 else "a.lmp"
+    lines = text.splitlines()
+    first = first or next(at for at, line in enumerate(lines, 1) if line.startswith("Atoms")) + 2
+    for at in (first, first + 5, first + 11):
+        cells = lines[at - 1].split()
+        odd = [
+            [cells[0], *cells],
+            cells[1:],
+            [cells[0], "odd", *cells[1:]],
+            ["".join(cells[:2]), *cells[2:]],
+            ["x"],
+            [],
+        ]
+        for changed in odd if first != 3 else odd[:2]:
+            content = "\n".join([*lines[: at - 1], " ".join(changed), *lines[at:]])
+            with pytest.raises(FileError, match=rf"{name}'(, line {at}: expected| states 12 atoms but contains 11)"):
+                ae.read_tip(save(content, name), NAMES if first != 3 else None)

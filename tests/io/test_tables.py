@@ -159,3 +159,36 @@ def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "a.csv").write_text("x [mm],y [mm]\n1,2\n")
     assert read("~/a.csv").x.tolist() == [1.0]
+
+
+ROWS_OF_IONS = [tuple(row) for row in np.random.default_rng(2).uniform(1, 30, (6, 4)).round(3).tolist()]
+ODD = {
+    "a word": lambda cells: ["x"],
+    "a cell less": lambda cells: cells[1:],
+    "a cell more": lambda cells: [*cells, cells[-1]],
+    "a word in it": lambda cells: [cells[0], "odd", *cells[1:]],
+    "glued": lambda cells: [cells[0] + cells[1], *cells[2:]],
+    "stars": lambda cells: ["**", *cells[1:]],
+    "a letter": lambda cells: [cells[0].replace(cells[0][-1], "O"), *cells[1:]],
+    "a quote": lambda cells: ['"' + cells[0], *cells[1:]],
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize(("divider", "comma"), [(",", False), (";", True), ("\t", False), (" ", False)])
+def test_one_odd_row_is_named(tmp_path, odd, divider, comma):
+    """Also the first or the last one: what most rows have decides on the divider and the number of columns."""
+    header = [divider.join(["x[nm]", "y[nm]", "z[nm]", "m/n"])]
+    lines = table(header, divider, comma, rows=ROWS_OF_IONS).splitlines()
+    for at in range(2, len(lines) + 1):
+        changed = divider.join(ODD[odd](lines[at - 1].split(divider)))
+        (tmp_path / "a.csv").write_text("\n".join([*lines[: at - 1], changed, *lines[at:]]))
+        with pytest.raises(FileError, match=rf"a\.csv', line {at}: expected"):
+            read(tmp_path / "a.csv")
+
+
+def test_an_odd_header_is_named(tmp_path):
+    lines = table(["x [nm],y [nm],z [nm]"], ",", rows=ROWS_OF_IONS)
+    (tmp_path / "a.csv").write_text(lines)
+    with pytest.raises(FileError, match=r"a\.csv', line 1: expected 4 cells, got 3"):
+        read(tmp_path / "a.csv")
