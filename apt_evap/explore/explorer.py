@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.codec import to_python
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence, digest
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
 from apt_evap.analysis.apex import image_compression
 from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.detection.binning import MAX_BINS, bins_for, field_of_view
@@ -261,11 +261,7 @@ class Explorer:
             isinstance(mine, MeasuredIons) and isinstance(theirs, MeasuredIons) and other.names[1] == self.names[1]
         ):
             return
-        columns = [
-            (ions.all.x, ions.all.y, ions.all.mass_to_charge, ions.all.time_of_flight) for ions in (mine, theirs)
-        ]
-        first, second = (digest(*(values for values in of if values is not None)) for of in columns)
-        if first == second:  # the file may have been replaced
+        if _are_equal(mine.all, theirs.all):  # the file may have been replaced, or read with other options
             self.ions_of_file = theirs
             self.selection_changed()
             if self.is_comparison and not self.registered:
@@ -873,3 +869,12 @@ def _has_window(like):
 
 def _starting_values(mechanism):
     return {control.name: control.value for control in controls_of(mechanism)}
+
+
+def _are_equal(first, second):
+    """Whether two `Hits` have the same columns with the same values."""
+    one, two = ({name: getattr(hits, name) for name in hits.columns} | hits.extra for hits in (first, second))
+    return one.keys() == two.keys() and all(
+        values.dtype == two[name].dtype and np.array_equal(values, two[name], equal_nan=values.dtype.kind == "f")
+        for name, values in one.items()
+    )

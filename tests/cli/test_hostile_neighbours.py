@@ -15,6 +15,7 @@ from apt_evap.cli.parser import COMMANDS, make_parser
 from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.fit.start_settings import is_start
+from apt_evap.simulation.simulation import Simulation
 from apt_evap.studies.sweep.planning import plan_sweep
 from apt_evap.workflows.kept_files import KeptFiles
 from apt_evap.workflows.twin_of_map import twin
@@ -145,7 +146,7 @@ RUNS = {
     "dataset": [("dataset", "study.toml", "-o", "set")],
     "visible": [("visible", "visible.toml")],
 }
-"""Command lines of all commands but `explore` and `twin`, which are below, and `paper`, which makes twins."""
+"""Command lines of all commands but `explore`, `twin` and `paper`, which are below."""
 SLOW = ("index", "start", "compare")
 
 
@@ -173,6 +174,24 @@ def test_a_file_that_is_opened_in_the_explorer_executes_nothing_beside_it(folder
     running = BackgroundRun(folder / "run.toml", folder / "other.h5")  # what the page writes has no such class
     running.stop(wait=True)
     assert not running.finished and "own_classes" in running.message
+
+
+@pytest.mark.slow
+def test_a_folder_of_the_paper_executes_nothing(folder, monkeypatch):
+    """Its runs are not made: what is beside them is met before, and again when the command continues."""
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Simulation, "run", stop)
+    for _ in range(2):
+        assert main(["paper", "--figure", "7"]) == 130
+        written = list((folder / "paper").rglob("*.toml"))
+        assert written
+        for path in written:
+            path.write_text(path.read_text() + PANELS.format("subprocess:Popen"))
+            for name in ("mine", "numpy", "run"):
+                (path.parent / f"{name}.py").write_text(CLASSES)
 
 
 @pytest.mark.slow

@@ -540,6 +540,11 @@ def test_a_run_keeps_the_selected_ions(run, measured):
     other = Explorer(run, measured, run_arguments=["run.h5"], file=MeasuredFile("other.epos"))
     other.keep_ions(before)
     assert other.measured is not before.measured
+    volts = replace(measured, voltage=np.full(len(measured), 5000.0))  # of --voltage-unit, in the same file
+    for first, second in ((measured, volts), (volts, replace(volts, voltage=volts.voltage + 1))):
+        before, other = Explorer(None, first, **words), Explorer(run, second, **words)
+        other.keep_ions(before)
+        assert other.measured is not before.measured
 
 
 def test_what_is_refused(run, measured):
