@@ -102,9 +102,9 @@ def test_strays_that_are_scattered_do_not_join_each_other():
 
 @pytest.mark.parametrize("n", [300, 2000, 20_000])
 def test_a_far_halo_is_stray(n):
-    """5 % of the ions, between 2.5 and 5 radii: 0.3 % of the density."""
+    """5 % of the ions, between 2.5 and 7 radii: 0.12 % of the density."""
     random = np.random.default_rng(27)
-    halo = 37.5 * np.sqrt(random.uniform(6.25, 25, n // 20)) * np.exp(2j * np.pi * random.random(n // 20))
+    halo = 37.5 * np.sqrt(random.uniform(6.25, 49, n // 20)) * np.exp(2j * np.pi * random.random(n // 20))
     places = np.concatenate([disc(n, 27), halo])
     strays = find_strays(places.real, places.imag)
     assert np.flatnonzero(strays).tolist() == list(range(n, n + n // 20))
