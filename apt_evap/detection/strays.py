@@ -17,15 +17,16 @@ _BINS = 64  # along the longer side
 _FEWEST = 16  # of so few ions, none is far outside
 # Chosen with 12 fields of view (disc, half, strip, ring, ramp, two poles, two spots, normal, divided by a line, a rim
 # of 1 %) and 11 kinds of strays (1 to 10 %: scattered, halos, ghosts, lines, numbers for "no position") of 200 to
-# 6,000 ions with one half of the seeds, and 180 normal distributions, which have no edge: 3 of 234 fields of view and
-# 17 of the 180 lose an ion or two, 32 of 180 with strays keep some (49 with a density of 1e-3; 18 with 6e-3, where 28
-# of 180 lose ions). Judged with the other half, up to a million ions: 1 of 237, a normal distribution, and 42 of 183
-# (60 with 1e-3). What is missed are halos of 5 % between 1.7 and 3 radii (17 of 18; they have 0.8 % of the density,
-# as a sparse rim may have) or 2.5 and 5 (9 of 18), and 5 % over an area of 16 times the field of view (16 of 19):
+# 6,000 ions with one half of the seeds, 180 normal distributions, which have no edge, and simulated maps with the
+# ions of their shank: 3 of 234 fields of view and 16 of the 180 lose an ion or two, 49 of 180 with strays keep some.
+# A density of 3e-3 (6e-3) would leave 32 (18) of these, but takes ions of a shank for strays, and of 17 (28) normal
+# distributions. Judged with the other half, up to a million ions: 1 of 237, a normal distribution, and 60 of 183.
+# What is missed are halos of 5 % between 1.7 and 3 radii (17 of 18; they have 0.8 % of the density, as a sparse rim
+# may have) or 2.5 and 5 (15 of 18), of 1 % (8 of 19), and 5 % over an area of 16 times the field of view (18 of 19):
 # density cannot tell these from a dim part of it. Nor is a number for "no position" inside the field of view found.
 _GAP = 1 / 6  # of the longer side: ions this far from the others are strays
 _GAP_OF_FEW = 4.0  # times the mean distance of neighbours if that is more: few ions are farther apart
-_DENSITY = 3e-3  # of the median density, averaged over a gap: fewer ions between strays do not join them
+_DENSITY = 1e-3  # of the median density, averaged over a gap: fewer ions between strays do not join them
 _PART = 0.05  # of the different places in the largest part: a part with fewer is stray
 _SAMPLE = 50_000
 _MOST_STEPS = 64  # strays at 1e30 mm hide those at 1e10 mm: each step finds those of its scale

@@ -100,16 +100,6 @@ def test_strays_that_are_scattered_do_not_join_each_other():
     assert np.abs(places[~strays]).max() < 37.5 * 1.3
 
 
-@pytest.mark.parametrize("n", [300, 2000, 20_000])
-def test_a_far_halo_is_stray(n):
-    """5 % of the ions, between 2.5 and 7 radii: 0.12 % of the density."""
-    random = np.random.default_rng(27)
-    halo = 37.5 * np.sqrt(random.uniform(6.25, 49, n // 20)) * np.exp(2j * np.pi * random.random(n // 20))
-    places = np.concatenate([disc(n, 27), halo])
-    strays = find_strays(places.real, places.imag)
-    assert np.flatnonzero(strays).tolist() == list(range(n, n + n // 20))
-
-
 def test_few_ions_have_no_strays():
     for x in ([1.0, 2.0], [0.0] * 14 + [1e6], [1.0] * 15):
         assert find_strays(np.array(x), np.zeros(len(x))) is None
