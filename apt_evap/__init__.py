@@ -3,7 +3,7 @@
 import lazy_loader
 
 from apt_evap._common.notebook import shown_by as _shown_by
-from apt_evap._version import __version__ as __version__
+from apt_evap._common.version import __version__ as __version__
 
 # names are imported when they are first used (SPEC 1 of Scientific Python): the list is __init__.pyi
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

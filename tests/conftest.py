@@ -27,7 +27,11 @@ import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import replace_file
 from apt_evap._common.locks import FileLock
+from apt_evap.explore import measured_ions
+from apt_evap.io import measured_file
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.spectra import mass_spectrum
+from apt_evap.spectra.mass_spectrum import spectrum
 
 PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
@@ -184,6 +188,27 @@ def run20(tip20, made_once):
     detector = ae.Detector(distance=100.0, width=300.0)
     flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
     return made_once(tip20, 15_000, flown, voltage=1000.0, seed=1, detector=detector, **ROUGH)
+
+
+@pytest.fixture(scope="session")
+def _spectra():
+    """Spectra by the hash of their ions and options."""
+    return {}
+
+
+@pytest.fixture
+def spectra_once(_spectra, monkeypatch):
+    """`ae.spectrum` computes that of the same ions with the same options once: for tests of what is made of it."""
+
+    def once(hits, *args, **options):
+        columns = {name: np.asarray(getattr(hits, name)) for name in (*hits.columns, "detected")}
+        key = hash_of(pickle.dumps((columns, args, sorted(options.items()))))
+        if key not in _spectra:
+            _spectra[key] = spectrum(hits, *args, **options)
+        return _spectra[key]
+
+    for place in (ae, measured_file, measured_ions, mass_spectrum):
+        monkeypatch.setattr(place, "spectrum", once)
 
 
 @pytest.fixture

@@ -210,13 +210,7 @@ class CheckedFile:
         *,
         compressed: bool = False,
     ) -> NDArray[Any]:
-        """Check the type, the shape and the place of a dataset, and read it.
-
-        Parameters
-        ----------
-        shape : tuple or None
-            Expected shape; None for any length, or for any shape.
-        """
+        """Check the type, the shape and the place of a dataset, and read it."""
         item = self._item(path)
         if not isinstance(item, h5py.Dataset):
             raise ValueError(f"{path} is not a dataset")

@@ -331,25 +331,10 @@ def for_json(thing: Any) -> Any:
 
 
 def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:
-    """Rebuild settings from their plain form.
+    """Rebuild settings from their plain form, or a table of a file, which may lack fields with a default.
 
-    Parameters
-    ----------
-    plain : mapping
-        Result of `to_plain`, or a table of a settings file. Fields with a default may be missing.
-    *kinds : type
-        Classes that it may be. The name of the class is under "name"; it may be missing if there is only one.
-    what : str
-        What it is, for messages.
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    ValueError
-        If the name or a field is unknown, missing or outside its range.
+    The name of the class is under "name"; it may be missing if there is only one. ValueError for a name or a field that
+    is unknown, missing or outside its range.
     """
     check_kind(plain, what, Mapping, "a table")
     by_name = {kind.__name__: kind for kind in kinds}

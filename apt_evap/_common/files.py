@@ -72,13 +72,7 @@ def open_for_reading(path: AnyPath) -> Iterator[BinaryIO]:
 
 
 def read_small_file(path: AnyPath, at_most: int, what: str) -> bytes:
-    """Read a complete small file.
-
-    Parameters
-    ----------
-    at_most : int
-        Largest allowed size [bytes].
-    """
+    """Read a complete small file of at most so many bytes."""
     parts, size = [], 0
     with open_for_reading(path) as file:
         while size <= at_most and (more := file.read(1 << 20)):

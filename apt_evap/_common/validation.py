@@ -32,24 +32,6 @@ def without_mask(value: Any, name: str, dtype: DTypeLike = np.float64) -> Any:
     """Return an array whose masked values are NaN; other values unchanged.
 
     NumPy drops the mask in conversions, so that missing values would become numbers.
-
-    Parameters
-    ----------
-    value : array_like
-        Input of the user, perhaps a masked array, or a sequence of these.
-    name : str
-        Name of the argument, for the message.
-    dtype : dtype
-        Type that the array is converted to.
-
-    Returns
-    -------
-    array_like
-
-    Raises
-    ------
-    ValueError
-        If values are masked and `dtype` has no NaN.
     """
     if isinstance(value, list | tuple) and any(np.ma.isMaskedArray(part) for part in value):
         value = np.ma.array(value)
@@ -147,27 +129,7 @@ def check_number(
 ) -> float:
     """Return `value` as a finite float within its bounds, or raise an error that names the argument.
 
-    Parameters
-    ----------
-    value : float
-        Input of the user.
-    name : str
-        Name of the argument, for the message.
-    above, at_least, at_most, below : float, optional
-        Bounds; `above` and `below` are exclusive.
-    unit : str
-        Unit for the message.
-    why : str
-        Meaning of the bound, for the message.
-
-    Returns
-    -------
-    float
-
-    Raises
-    ------
-    ValueError
-        Names the argument, its value and the bounds.
+    The bounds `above` and `below` are exclusive. The message has the unit, and the meaning of the bound in `why`.
     """
     value = value.item() if isinstance(value, np.number) else value  # bounds may overflow in single precision
     number = isinstance(value, Real) and not isinstance(value, bool)
@@ -188,26 +150,7 @@ def check_number(
 
 
 def check_count(value: Any, name: str, *, at_least: int = 0, at_most: int = _LARGEST_COUNT) -> int:
-    """Return `value` as an int from `at_least` to `at_most`, or raise an error that names the argument.
-
-    Parameters
-    ----------
-    value : int
-        Input of the user.
-    name : str
-        Name of the argument, for the message.
-    at_least, at_most : int
-        Smallest and largest value allowed.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    ValueError
-        Names the argument, its value and the bounds.
-    """
+    """Return `value` as an int from `at_least` to `at_most`, or raise an error that names the argument."""
     integer = isinstance(value, Integral) and not isinstance(value, bool)
     if not integer or not at_least <= value <= at_most:
         bounds = f">= {at_least}"
@@ -238,28 +181,7 @@ def check_choice(value: Any, name: str, known: Iterable[str]) -> str:
 
 
 def check_kind(value: Any, name: str, kind: Any, expected: str) -> Any:
-    """Return `value` if it has the right type, or raise an error that names the argument.
-
-    Parameters
-    ----------
-    value : object
-        Input of the user.
-    name : str
-        Name of the argument, for the message.
-    kind : type or str
-        The type, or the name of a method that `value` must have.
-    expected : str
-        What it must be, such as "a Detector".
-
-    Returns
-    -------
-    object
-
-    Raises
-    ------
-    ValueError
-        Names the argument, its value and the expected type.
-    """
+    """Return `value` if it is of a type, or has a method of this name, or raise an error that names the argument."""
     good = callable(getattr(value, kind, None)) if isinstance(kind, str) else isinstance(value, kind)
     if not good or isinstance(value, type):
         raise ValueError(f"{name} must be {expected}, got {short_text(value)}")

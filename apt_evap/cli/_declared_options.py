@@ -28,19 +28,7 @@ class _Declaration(NamedTuple):
 def add_declared(
     parser: Any, module: str, settings: str, fields: Iterable[str], flags: Mapping[str, str] | None = None
 ) -> None:
-    """Add the options that set fields of a class of settings; None unless they are used.
-
-    Parameters
-    ----------
-    parser : argparse.ArgumentParser or group
-        Where to add them.
-    module, settings : str
-        Module of the class below the package, such as "fit.grid", and name of the class.
-    fields : iterable of str
-        Fields that have an option.
-    flags : mapping, optional
-        Flags of fields that have another name; by default the name with hyphens.
-    """
+    """Add the options that set fields of a class of settings; None unless they are used."""
     declared = declarations(module, settings)
     for field in fields:
         flag = (flags or {}).get(field) or _flag(field)

@@ -48,23 +48,7 @@ def _run_in(path):
 
 
 def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, ExplorerSettings | None]:
-    """Explorer of the files of the command, and the view of its options; None without a file.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        Parsed arguments.
-
-    Returns
-    -------
-    explorer : Explorer
-    view : ExplorerSettings
-
-    Raises
-    ------
-    ValueError
-        If an option or a file is invalid.
-    """
+    """Explorer of the files of the command, and the view of its options; None without a file."""
     run = None if options.run is None else _run_in(options.run)
     if options.run is not None and run is None:
         if options.file is not None:

@@ -16,7 +16,10 @@ MATERIAL_HELP = "Ni, or a material of your own, as a table {name = ...} or a fil
 
 
 def add_reading(parser: argparse.ArgumentParser) -> Any:
-    """Add options for reading a file and selecting ions; return the first group."""
+    """Add options for reading a file and selecting ions; return the first group.
+
+    `apt-evap info --help` describes them, the help of other commands names them.
+    """
     group = parser.add_argument_group("reading of files")
     group.add_argument("--format", metavar="SUFFIX", help="read ions in this format, such as .pos")
     group.add_argument("--partial", action="store_true", default=None, help="read a truncated file to its last ion")
@@ -45,6 +48,9 @@ def add_reading(parser: argparse.ArgumentParser) -> Any:
     selection.add_argument(
         "--species", metavar="NAME[,NAME]", help="ions of these names, such as Si: in --ranges, or of a run"
     )
+    if not parser.prog.endswith(" info"):
+        for each in (group, selection):
+            parser.common.append((each, tuple(each._group_actions)))  # type: ignore[attr-defined]
     return group
 
 

@@ -46,13 +46,7 @@ def _to_stdout() -> Iterator[None]:
 
 
 def put(text: str) -> None:
-    """Print on stdout without delay.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written; BrokenPipeError if the reader has closed the pipe.
-    """
+    """Print on stdout without delay."""
     with _to_stdout():
         print(text, flush=True)
 

@@ -17,13 +17,7 @@ NAMED = "The name of a shipped example, such as `{}`, also does: its files are c
 
 
 def shipped() -> list[Path]:
-    """Files of the examples, sorted.
-
-    Raises
-    ------
-    FileError
-        If the installed package lacks them.
-    """
+    """Files of the examples, sorted."""
     from apt_evap._common.files import FileError
 
     for place in _PLACES:
@@ -48,22 +42,6 @@ def settings_file(options: argparse.Namespace, name: str) -> str:
 
     A file or folder of this path wins. An example is copied to the working folder, with the files that it reads, so
     that all output is beside it and its numbers can be changed; what is in this folder already is left as it is.
-
-    Parameters
-    ----------
-    options : argparse.Namespace
-        The options of the command.
-    name : str
-        What the user has typed.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    FileError
-        If it has neither folder nor suffix and is not the name of an example, or a file cannot be written.
     """
     from apt_evap._common.files import FileError, replace_file
     from apt_evap._common.validation import did_you_mean

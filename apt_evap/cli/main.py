@@ -24,18 +24,7 @@ from apt_evap.warnings import AptWarning
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Arguments after the name of the program; those of the process by default.
-
-    Returns
-    -------
-    int
-        Exit code, see `apt_evap.cli.parser.EXIT_CODES`.
-    """
+    """Run the command line."""
     open_missing_streams()
     with warnings.catch_warnings(), _drawing_into_files(), _terminated_like_interrupted() as terminated:
         warnings.simplefilter("default", AptWarning)  # a command prints its warnings, whatever the filters

@@ -2,11 +2,12 @@
 
 import argparse
 import re
+import textwrap
 from collections.abc import Iterable
 from importlib import import_module
 from typing import Any, NoReturn
 
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.cli._options import SHAPE
 from apt_evap.cli._output import put
 
@@ -75,18 +76,7 @@ COMMANDS = {
 
 
 def make_parser(command: str | None = None) -> argparse.ArgumentParser:
-    """Make the parser of the command line.
-
-    Parameters
-    ----------
-    command : str, optional
-        Name of the only command that has its arguments, so that no other module is imported; by default all have.
-
-    Returns
-    -------
-    argparse.ArgumentParser
-        Its errors are ValueErrors. The parsed options contain the name of the command as `command`.
-    """
+    """Make the parser of the command line."""
     parser = _Parser(
         prog="apt-evap",
         description="Field evaporation in atom probe tomography: simulate the evaporation of a specimen atom by atom,\n"
@@ -106,7 +96,23 @@ def make_parser(command: str | None = None) -> argparse.ArgumentParser:
 class _Parser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self.common: list[tuple[Any, tuple[argparse.Action, ...]]] = []  # groups with options that are named alone
         self._negative_number_matcher = re.compile(r"-\.?\d")  # a value such as -9.6,4 is not an option
+
+    def format_help(self) -> str:
+        kept = [(group, group.description, actions, [each.help for each in actions]) for group, actions in self.common]
+        try:
+            for group, _, actions, _ in kept:
+                names = ", ".join(action.option_strings[0] for action in actions)
+                group.description = textwrap.fill(f"see apt-evap info --help: {names}", 100)
+                for action in actions:
+                    action.help = argparse.SUPPRESS
+            return super().format_help()
+        finally:
+            for group, description, actions, texts in kept:
+                group.description = description
+                for action, text in zip(actions, texts, strict=True):
+                    action.help = text
 
     def error(self, message: str) -> NoReturn:
         raise ValueError(f"{message} (see {self.prog} --help)")

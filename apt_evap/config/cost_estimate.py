@@ -4,7 +4,7 @@ import math
 
 from apt_evap._common.codec import count, number, settings
 from apt_evap._common.memory import copied_memory, needed_memory
-from apt_evap.config.simulation_file import Config
+from apt_evap.config.simulation_settings import Config
 from apt_evap.specimen.tip import estimated_atoms
 
 # Measured: resident memory of the program before a specimen is built, and after its pictures are drawn, 126 to 140 MB

@@ -6,255 +6,36 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.codec import from_plain, is_plain, to_plain
-from apt_evap._common.files import FileError, check_path, read_small_file, sha256_of
-from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_switch, short_text
+from apt_evap._common.codec import from_plain, is_plain
+from apt_evap._common.files import FileError, check_path, read_small_file
+from apt_evap._common.validation import check_count, check_number, check_seed, check_switch, short_text
 from apt_evap.config.lens_text import read_lens
 from apt_evap.config.map_panels import MapSettings
 from apt_evap.config.own_classes import with_own_objects
-from apt_evap.config.tables import check_keys, check_table
+from apt_evap.config.simulation_settings import Config, host_of
+from apt_evap.config.tables import check_keys, check_table, located
 from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
-from apt_evap.detection.microscope.local_electrode import LocalElectrode
-from apt_evap.detection.microscope.run_lens import field_of_view
-from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.evaporation.cap import doubt_of_cap
 from apt_evap.evaporation.charge_settings import ChargeSettings
-from apt_evap.evaporation.law import Law, check_law
-from apt_evap.evaporation.rule import RULES, CompiledRule, Rule, check_rule
+from apt_evap.evaporation.law import check_law
+from apt_evap.evaporation.rule import RULES, check_rule
 from apt_evap.evaporation.thermal import LAWS
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
-from apt_evap.io.specimens import read_tip
-from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightSettings
+from apt_evap.simulation.flight.flight_pool import FlightSettings
 from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import Monitor
-from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
-from apt_evap.simulation.run import Run
+from apt_evap.simulation.real_units import OperatingPoint
 from apt_evap.simulation.run_hdf5 import is_run
-from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import as_material
 from apt_evap.specimen.phases import Phase, check_phases
 from apt_evap.specimen.tip import Tip
 
-_KINDS = {
-    "path": Path,
-    "tip": Mapping,
-    "detector": Detector,
-    "charge_settings": ChargeSettings,
-    "flight_settings": FlightSettings,
-    "response_settings": ResponseSettings,
-    "monitor": Monitor,
-    "maps": MapSettings,
-}
 _MAX_BYTES = 1 << 22  # bytes
 _DIGITS = 12  # of a key: two of 100,000 settings have the same one with a probability of 2e-5
 _LENGTH = re.compile(r"\s*(\S+?)\s*(a|nm)\s*")
-
-
-@dataclass(frozen=True, repr=False)
-class Config:
-    """Settings of a simulation from a TOML file; made by `read_config`.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    tip : dict
-        Arguments of `Tip`, or of `read_tip` if there is a "path".
-    n_ions : int
-        Number of atoms to evaporate.
-    responses : bool
-        Whether to compute responses. Perturbations of the maps that need their own flights are flown.
-    voltage : float
-        Applied voltage [V].
-    seed : int
-        Seed of the random numbers of the perturbations.
-    detector : Detector
-        The detector.
-    charge_settings, flight_settings, response_settings : ChargeSettings, FlightSettings, ResponseSettings
-        Accuracy of the computation.
-    monitor : Monitor
-        Monitoring of the run.
-    maps : MapSettings
-        Maps of the run.
-    output : str or None
-        File name of the run.
-    law : law
-        Selects the next atom to evaporate.
-    control : VoltageControl or None
-        Rate, pulses and control of the voltage.
-    real_units : OperatingPoint or None
-        Argument of `Run.at_evaporation_field`; None: the run is saved at the simulated voltage.
-    rule : charging rule
-        Distribution of the charge over the surface.
-    microscope : LocalElectrode or None
-        Lens in front of the specimen, for `Run.at_evaporation_field`.
-    key : str
-        Result of `key_of` for the content of the file.
-
-    Raises
-    ------
-    ValueError
-        If a field has the wrong type or is outside its range, or the maps do not fit the detector.
-    """
-
-    path: Path
-    tip: dict
-    n_ions: int
-    responses: bool
-    voltage: float
-    seed: int
-    detector: Detector
-    charge_settings: ChargeSettings
-    flight_settings: FlightSettings
-    response_settings: ResponseSettings
-    monitor: Monitor
-    maps: MapSettings
-    output: str | None
-    law: Law
-    control: VoltageControl | None
-    real_units: OperatingPoint | None
-    rule: Rule | CompiledRule
-    microscope: LocalElectrode | None
-    key: str = ""
-
-    def __post_init__(self):
-        for name, kind in _KINDS.items():
-            check_kind(getattr(self, name), name, kind, f"of type {kind.__name__}")
-        check_count(self.n_ions, "n_ions", at_least=1)
-        check_switch(self.responses, "responses")
-        check_voltage(self.voltage)
-        check_seed(self.seed)
-        if self.output is not None and not (isinstance(self.output, str) and self.output):
-            raise ValueError(f"output must be a file name such as 'run.h5', got {short_text(self.output)}")
-        self.maps.check_detector(self.detector)
-        if self.real_units is not None and not self.responses:
-            for perturbation in self.emissions:  # energies are those of an experiment, the flight would be at 1000 V
-                if perturbation != Unperturbed():
-                    raise ValueError(
-                        f"[simulation] responses must be true for maps of {short_text(perturbation)} in real units"
-                    )
-        check_law(self.law)
-        check_rule(self.rule)
-
-    def __repr__(self) -> str:
-        panels = ", ".join(panel.title for panel in self.maps.panels)
-        if "path" in self.tip:
-            specimen = f"from {str(self.tip['path'])!r}"
-        else:
-            specimen = f"of {_host(self.tip).name}, apex radius {self.tip['apex_radius']:.4g} nm"
-        return f"<Config {str(self.path)!r}: {self.n_ions:,} ions {specimen}; maps: {panels}>"
-
-    @property
-    def emissions(self) -> tuple[Perturbation, ...]:
-        """Perturbations of the maps with their own flights: those for which the run has no responses."""
-        perturbations: list[Perturbation] = []  # one of a user may have no hash
-        for panel in self.maps.panels:
-            by_response = self.responses and callable(getattr(panel.perturbation, "tangential", None))
-            if not by_response and panel.perturbation not in perturbations:
-                perturbations.append(panel.perturbation)
-        return tuple(perturbations)
-
-    def specimen(self) -> Tip:
-        """Build the specimen, or read it from its file.
-
-        Raises
-        ------
-        FileError
-            If it is impossible, or its file cannot be read or has another SHA-256 than the settings.
-        """
-        with _located(self.path, "tip"):
-            if "path" not in self.tip:
-                return Tip(**self.tip)
-            settings = dict(self.tip)
-            expected = settings.pop("sha256", None)
-            if expected is not None and (digest := sha256_of(settings["path"])) != expected:
-                raise ValueError(
-                    f"{str(settings['path'])!r} has changed: expected sha256 {short_text(expected)}, got {digest!r}"
-                )
-            try:
-                return read_tip(**settings)
-            except ImportError as error:  # a format that needs another package
-                raise ValueError(str(error)) from error
-
-    def simulation(self, *, n_threads: int | None = None) -> Simulation:
-        """Build the specimen and the simulation.
-
-        Parameters
-        ----------
-        n_threads : int, optional
-            Number of threads; by default the number of processors that this process may use.
-
-        Returns
-        -------
-        Simulation
-
-        Raises
-        ------
-        FileError
-            If the specimen is impossible, or the flights do not fit the specimen; the message names the file.
-        """
-        tip = self.specimen()
-        if self.real_units is not None:
-            with _located(self.path, "real_units"):
-                names = tuple(element.name for element in tip.elements)
-                check_flight_charges(self.real_units.flight_charges, names)
-        with _located(self.path):  # flights and tip or detector: no single table
-            flight_settings = self.flight_settings
-            if self.microscope is not None and flight_settings.field_of_view == WHOLE_DETECTOR:
-                angle = field_of_view(self.microscope, tip, self.detector)
-                flight_settings = replace(flight_settings, field_of_view=angle)
-            simulation = Simulation(
-                tip,
-                voltage=self.voltage,
-                seed=self.seed,
-                detector=self.detector,
-                charge_settings=self.charge_settings,
-                flight_settings=flight_settings,
-                response_settings=self.response_settings,
-                monitor=self.monitor,
-                n_threads=n_threads,
-                law=self.law,
-                rule=self.rule,
-                control=self.control,
-            )
-        with _located(self.path, "real_units" if self.microscope is None else "microscope"):
-            self._check_cap(simulation)
-        return simulation
-
-    def _check_cap(self, simulation):
-        """Raise a ValueError, before the simulation, if real units need a cap and there is none."""
-        if self.real_units is None and self.microscope is None:
-            return
-        reference = (self.real_units or OperatingPoint()).field_reference
-        if reference == "cap":
-            doubt = doubt_of_cap(simulation.emitter.cap.radius, simulation.tip.settings.get("apex_radius"))
-            if doubt:
-                raise ValueError(doubt)
-
-    def with_origin(self, run: Run) -> Run:
-        """The run with the name of this file, its maps and its key in the provenance."""
-        origin = {"config": self.path.name, "maps": to_plain(self.maps), "settings": self.key}
-        return replace(run, provenance=run.provenance | origin)
-
-    def as_saved(self, run: Run) -> Run:
-        """The run as it is saved: with its origin, and in real units if the file has a table for them.
-
-        Raises
-        ------
-        FileError
-            If it cannot be converted; the message names the file.
-        """
-        run = self.with_origin(run)
-        if self.real_units is None and self.microscope is None:
-            return run
-        with _located(self.path, "real_units" if self.microscope is None else "microscope"):
-            return run.at_evaporation_field(self.microscope, self.real_units)
 
 
 def read_config(path: str | Path, *, own_classes: bool = False) -> Config:
@@ -340,42 +121,42 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
     FileError
         If a table, key or value is wrong; the message names it.
     """
-    with _located(path):
+    with located(path):
         check_switch(own_classes, "own_classes")
         key = key_of(document)
         document = with_own_objects(document, path.parent if own_classes else None)
     # the specimen
     phases = None
     if "phases" in document:
-        with _located(path, "phases"):
+        with located(path, "phases"):
             phases = check_phases(_phases(document["phases"]))
-    with _located(path, "tip"):
+    with located(path, "tip"):
         if phases is not None and "file" in document["tip"]:
             raise ValueError("[[phases]] cannot be combined with a specimen file")
         tip = _tip_from_file(document["tip"], path) if "file" in document["tip"] else _tip(document["tip"], phases)
-    with _located(path, "simulation"):
+    with located(path, "simulation"):
         simulation = _simulation(document["simulation"])
     # tables that are the fields of a class; objects of the user's own classes are checked as those of Python
     objects = {}
     for name, kinds in _CLASSES.items():
-        with _located(path, name):
+        with located(path, name):
             table = document.get(name, {})
             if is_plain(table):
                 table = from_plain(table, *kinds, what=name) if table else kinds[0]()
             objects[name] = table
-    with _located(path, "law"):
+    with located(path, "law"):
         check_law(objects["law"])
-    with _located(path, "rule"):
+    with located(path, "rule"):
         check_rule(objects["rule"])
-    with _located(path, "responses"):
+    with located(path, "responses"):
         response_settings = from_plain(document.get("responses", {}), ResponseSettings, what="responses")
-    with _located(path, "real_units"):
+    with located(path, "real_units"):
         real_units = None
         if "real_units" in document:
             real_units = from_plain(document["real_units"], OperatingPoint, what="real_units")
-    with _located(path, "microscope"):
+    with located(path, "microscope"):
         microscope = read_lens(document["microscope"]) if "microscope" in document else None
-    with _located(path, "maps"):
+    with located(path, "maps"):
         maps = from_plain(document.get("maps", {}), MapSettings, what="maps")
         maps.check_detector(objects["detector"])
     return Config(
@@ -464,11 +245,6 @@ def _phases(tables):
     return [from_plain(table, Phase, what="phases") for table in tables]
 
 
-def _host(tip):
-    """Material, or that of the matrix."""
-    return tip["phases"][0].material if "phases" in tip else tip["material"]
-
-
 def _tip(table, phases):
     """Arguments of `Tip` from the table [tip], and the phases if there are any."""
     known = tuple(name for name in inspect.signature(Tip).parameters if name != "phases")
@@ -479,7 +255,7 @@ def _tip(table, phases):
         known = tuple(name for name in known if name not in ("material", "solutes"))
         check_keys(table, known, ("apex_radius",))
         settings = dict(table, phases=phases)
-    host = _host(settings)
+    host = host_of(settings)
     for name in ("apex_radius", "shank_length", "depth"):
         if name in settings:
             settings[name] = _length(settings[name], name, host.a)
@@ -526,12 +302,3 @@ def _length(value, name, a):
         raise ValueError(
             f"{name} must be a number [nm] or text such as '20 a' or '7 nm', got {short_text(value)}"
         ) from None
-
-
-@contextmanager
-def _located(path, table=None):
-    """Add the file and table to the message of an error."""
-    try:
-        yield
-    except ValueError as error:
-        raise FileError(f"{str(path)!r}{f', [{table}]' if table else ''}: {error}") from error

@@ -1,8 +1,11 @@
 """Validation of tables of a TOML file."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
+from apt_evap._common.files import FileError
+from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import did_you_mean, short_text
 
 
@@ -22,3 +25,12 @@ def check_keys(table: Mapping[str, Any], known: tuple[str, ...], needed: tuple[s
     for key in needed:
         if key not in table:
             raise ValueError(f"{key} is missing; required are {', '.join(needed)}")
+
+
+@contextmanager
+def located(path: AnyPath, table: str | None = None) -> Iterator[None]:
+    """Add the file and table to the message of an error."""
+    try:
+        yield
+    except ValueError as error:
+        raise FileError(f"{str(path)!r}{f', [{table}]' if table else ''}: {error}") from error

@@ -8,6 +8,7 @@ affine in each triangle of a Delaunay triangulation.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -18,6 +19,15 @@ from apt_evap._common.validation import check_array
 
 _FEWEST = 6  # crossings: as many as two squares
 _SLIVER = 0.1  # smallest height of a triangle over its longest side: thinner ones lie at the rim only
+
+
+class _Fit(NamedTuple):
+    """Corrected crossings [mm], whether the grid is mirrored, and the triangles that are not slivers at the rim."""
+
+    corrected: Floats
+    mirrored: bool
+    triangles: scipy.spatial.Delaunay
+    proper: np.ndarray
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,10 +58,7 @@ class DistortionGrid:
     detector: np.ndarray
     grid: np.ndarray
     source: str = ""
-    residual: float = field(init=False)
-    """Root mean square distance of the distorted from the corrected crossings [mm]."""
-    mirrored: bool = field(init=False)
-    """Whether the grid fits the detector better mirrored, as if the axes of one of them were exchanged."""
+    _fit: _Fit = field(init=False)
 
     def __post_init__(self):
         detector = check_array(self.detector, "detector", ("n", 2))
@@ -76,28 +83,34 @@ class DistortionGrid:
                 f"{name} must not be folded: adjacent crossings around ({folded[0]:.3g}, {folded[1]:.3g}) mm on the "
                 "detector are in another order in the plane of the grid"
             )
-        object.__setattr__(self, "mirrored", mirrored)
         object.__setattr__(self, "detector", detector)
         object.__setattr__(self, "grid", grid)
-        object.__setattr__(self, "residual", float(np.sqrt(np.mean(np.sum((fitted - detector) ** 2, axis=1)))))
-        object.__setattr__(self, "_corrected", fitted)
-        object.__setattr__(self, "_triangles", triangles)
-        object.__setattr__(self, "_proper", proper)
+        object.__setattr__(self, "_fit", _Fit(fitted, bool(mirrored), triangles, proper))
+
+    @property
+    def residual(self) -> float:
+        """Root mean square distance of the distorted from the corrected crossings [mm]."""
+        return float(np.sqrt(np.mean(np.sum((self._fit.corrected - self.detector) ** 2, axis=1))))
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the grid fits the detector better mirrored, as if the axes of one of them were exchanged."""
+        return self._fit.mirrored
 
     def undistorted(self, x: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
         """Corrected places [mm] for places x, y on the detector [mm], all of shape (n,); NaN outside the grid."""
         x = check_array(x, "x", ("n",), finite=False)
         y = check_array(y, "y", (len(x),), finite=False)
         places = np.column_stack([x, y])
-        triangles: scipy.spatial.Delaunay = self._triangles  # type: ignore[attr-defined]
+        triangles: scipy.spatial.Delaunay = self._fit.triangles
         index = triangles.find_simplex(np.where(np.isfinite(places), places, 1e300))
         inside = np.flatnonzero(index >= 0)
-        inside = inside[self._proper[index[inside]]]  # type: ignore[attr-defined]
+        inside = inside[self._fit.proper[index[inside]]]
         simplex = index[inside]
         transform = triangles.transform[simplex]
         first = np.einsum("ijk,ik->ij", transform[:, :2], places[inside] - transform[:, 2])
         weights = np.column_stack([first, 1 - first.sum(axis=1)])
-        corners = self._corrected[triangles.simplices[simplex]]  # type: ignore[attr-defined]
+        corners = self._fit.corrected[triangles.simplices[simplex]]
         result = np.full(places.shape, np.nan)
         result[inside] = np.einsum("ij,ijk->ik", weights, corners)
         return result[:, 0], result[:, 1]

@@ -17,14 +17,15 @@ finite also for ions that fly parallel to a plane detector or away from it, wher
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import number, settings, switch, vector
 from apt_evap._common.small_matrices import lengths
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, check_switch
+from apt_evap._common.validation import check_array, check_number
 from apt_evap._core.elementary import arctangent
 
 
@@ -86,24 +87,9 @@ def angle_of(radius: Floats, compression: float | None, barrel: float = 0.0) -> 
     return radius if compression is None else compression * np.arctan(radius / compression)
 
 
-@dataclass(frozen=True)
+@settings
 class Projection:
     """Projection of directions in the specimen onto the detector.
-
-    Parameters
-    ----------
-    scale : float
-        Distance on the detector per angle in the specimen, at the centre [mm/rad].
-    centre : tuple of float
-        Position of the specimen axis on the detector [mm].
-    mirror : bool
-        Whether x of the map is opposite to x of the specimen.
-    compression : float, optional
-        None for the azimuthal equidistant projection. A number is the image compression xi onto a plane detector: the
-        angle in the specimen divided by the angle of the straight flight.
-    barrel : float
-        Term b of a lens [1/rad^2], without a compression: the rim at the angle theta is nearer to the centre by the
-        fraction b theta^2.
 
     Raises
     ------
@@ -119,20 +105,23 @@ class Projection:
     Microsc. Microanal. 23, 238 (2017)); simulated ions on a plane are described by the second (`image_compression`).
     """
 
-    scale: float
-    centre: tuple = (0.0, 0.0)
-    mirror: bool = False
-    compression: float | None = None
-    barrel: float = 0.0
+    scale: float = number("Distance on the detector per angle in the specimen, at the centre", above=0, unit="mm/rad")
+    centre: tuple = vector("Position of the specimen axis on the detector", 2, default=(0.0, 0.0), unit="mm")
+    mirror: bool = switch("Whether x of the map is opposite to x of the specimen", default=False)
+    compression: float | None = number(
+        "None for the azimuthal equidistant projection. A number is the image compression xi onto a plane detector: "
+        "the angle in the specimen divided by the angle of the straight flight.",
+        default=None,
+        above=0,
+    )
+    barrel: float = number(
+        "Term b of a lens, without a compression: the rim at the angle theta is nearer to the centre by the fraction "
+        "b theta^2.",
+        default=0.0,
+        unit="1/rad^2",
+    )
 
-    def __post_init__(self):
-        object.__setattr__(self, "scale", check_number(self.scale, "scale", above=0, unit="mm/rad"))
-        object.__setattr__(self, "centre", tuple(check_array(self.centre, "centre", (2,)).tolist()))
-        object.__setattr__(self, "mirror", check_switch(self.mirror, "mirror"))
-        if self.compression is not None:
-            compression = check_number(self.compression, "compression", above=0)
-            object.__setattr__(self, "compression", compression)
-        object.__setattr__(self, "barrel", check_number(self.barrel, "barrel", unit="1/rad^2"))
+    def _check(self):
         if self.barrel and self.compression is not None:
             raise ValueError(f"give compression or barrel, not both, got {self.compression:g} and {self.barrel:g}")
 

@@ -252,13 +252,7 @@ class IndexPanel:
         self._clear()
 
     def read(self) -> Marks:
-        """The marks on the map.
-
-        Raises
-        ------
-        ValueError
-            If no crystal is chosen.
-        """
+        """The marks on the map."""
         if not self.material.value:
             raise ValueError("choose the crystal first")
         marks = Marks(self.material.value)

@@ -107,13 +107,7 @@ class MeasuredIons:
         return named
 
     def select(self, selection: IonSelection) -> Hits:
-        """Show a part of the ions, and return it.
-
-        Raises
-        ------
-        ValueError
-            If masses are not known, or no ions, or too few of the element, remain; the selection is then as before.
-        """
+        """Show a part of the ions, and return it."""
         flight = self.distance, self.time_zero
         if self.flight is not None and (selection.mass is not None or selection.ranges is not None):
             flight = self.flight  # the masses of the spectrum

@@ -16,7 +16,7 @@ from apt_evap._common.files import open_for_reading, replace_file, sha256_of
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.config.cost_estimate import CostEstimate, estimate_cost, hours_text
 from apt_evap.config.material_text import material_value
 from apt_evap.config.perturbation_text import write_perturbation

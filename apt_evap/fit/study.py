@@ -13,7 +13,7 @@ from apt_evap._common.digits import rounded_text
 from apt_evap._common.files import replace_file
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath, Floats
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import described

@@ -27,7 +27,7 @@ from apt_evap._common.nexus import (
 )
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind, check_sequence, short_text
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.detection.hits import Hits
 from apt_evap.io._records import check_columns
 from apt_evap.io._texts import ELEMENTS

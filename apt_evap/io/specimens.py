@@ -5,6 +5,7 @@ import tempfile
 import warnings
 from collections import Counter
 from collections.abc import Mapping
+from itertools import islice, takewhile
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_choice, check_kind
+from apt_evap._common.validation import check_choice, check_kind, short_text
 from apt_evap.io._texts import SYMBOLS, is_compressed, read_bytes, read_head, without_compression
 from apt_evap.io.lammps import Atoms, checked_frame, is_data, is_dump, read_data, read_dump
 from apt_evap.io.tapsim_nodes import is_nodes, read_nodes
@@ -170,6 +171,20 @@ def specimen_format(path: AnyPath) -> str:
     return "xyz" if is_xyz(without_compression(path).suffix.lower(), head) else "ase"
 
 
+def _check_counts(path, source):
+    """Refuse more atoms than the bytes of a POSCAR can describe: ASE lists their symbols before it reads a place."""
+    size = os.path.getsize(source)
+    with open(source, errors="replace") as file:
+        lines = list(islice(file, 7))
+    for number, line in enumerate(lines[5:], 6):  # the second one after a line of symbols
+        atoms = sum(int(word) for word in takewhile(str.isdecimal, line.split()))
+        if atoms > size:
+            raise FileError(
+                f"{str(path)!r}, line {number}: expected the numbers of the atoms, got {short_text(line.strip())} in a "
+                f"file of {size:,} bytes"
+            )
+
+
 def _read_ase(path, frame=-1):
     """Atoms of ASE, from a file of any format that it reads."""
     head = read_head(path, 64)
@@ -194,6 +209,8 @@ def _read_ase(path, frame=-1):
                         f"{str(path)!r} is a file of the format {kind}, whose types ASE reads as atomic numbers, "
                         "expected a text dump or a data file of LAMMPS"
                     )
+                if kind in ("vasp", "vasp-xdatcar"):
+                    _check_counts(path, source)
                 # neither "@" nor "-" in a name has a meaning of its own here
                 atoms = read(source, index=frame, do_not_split_by_at_sign=True)
             if not hasattr(atoms, "get_chemical_symbols"):

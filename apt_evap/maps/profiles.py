@@ -1,12 +1,13 @@
 """Density of hits along a circle, a radius or across a zone line, with counting errors; comparison of two profiles."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 
+from apt_evap._common.codec import number, settings, vector
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
@@ -31,19 +32,9 @@ class Profile(NamedTuple):
         return short_repr(self)
 
 
-@dataclass(frozen=True)
+@settings
 class Rectangle:
     """Rectangle on the detector along a zone line.
-
-    Parameters
-    ----------
-    centre : tuple of float
-        Centre x, y [mm].
-    angle : float
-        Direction of the line, from x towards y [degrees]. Distances are positive to the left of the line: along y for
-        an angle of 0, along x for -90.
-    length, width : float
-        Size along the line and across it [mm].
 
     Raises
     ------
@@ -51,16 +42,14 @@ class Rectangle:
         If a number is not finite, or a length is not positive.
     """
 
-    centre: tuple
-    angle: float
-    length: float
-    width: float
-
-    def __post_init__(self):
-        object.__setattr__(self, "centre", tuple(check_array(self.centre, "centre", (2,)).tolist()))
-        object.__setattr__(self, "angle", check_number(self.angle, "angle", unit="degrees"))
-        for name in ("length", "width"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, above=0, unit="mm"))
+    centre: tuple = vector("Centre x, y", 2, unit="mm")
+    angle: float = number(
+        "Direction of the line, from x towards y. Distances are positive to the left of the line: along y for an angle "
+        "of 0, along x for -90.",
+        unit="degrees",
+    )
+    length: float = number("Size along the line", above=0, unit="mm")
+    width: float = number("Size across the line", above=0, unit="mm")
 
     def along_and_across(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """Distances from the centre along the line and across it [mm], shape (n,) each, of positions x, y [mm]."""

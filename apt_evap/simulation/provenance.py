@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import scipy
 
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 
 
 def provenance_now() -> dict[str, Any]:

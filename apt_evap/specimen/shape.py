@@ -1,18 +1,18 @@
 """The shape of a tip: a spherical cap on a cone, as a signed distance."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from apt_evap._common.codec import choice, number, settings
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_choice, check_number
 from apt_evap._core.elementary import sine_and_cosine
 
 _LONGEST = 1e7  # [nm]: 1 cm is larger than any tip, and volumes keep their precision
 
 
-@dataclass(frozen=True)
+@settings
 class TaperedCap:
     """A spherical cap on a shank that widens downwards.
 
@@ -20,35 +20,18 @@ class TaperedCap:
     the foot of radius R + L sin(alpha) around z = -L. Between them is the cone rho cos(alpha) + z sin(alpha) = R. With
     ``base="flat"`` this cone continues to z = -L and is cut there.
 
-    Parameters
-    ----------
-    apex_radius : float
-        Radius R of the cap [nm].
-    shank_length : float
-        Length L of the shank [nm].
-    shank_angle : float
-        Half the opening angle alpha of the shank [degrees], >= 0 and < 45.
-    base : str
-        "rounded" or "flat".
-
     Raises
     ------
     ValueError
         If a number is outside its range, or the base is unknown.
     """
 
-    apex_radius: float
-    shank_length: float
-    shank_angle: float = 1.5
-    base: str = "rounded"
-
-    def __post_init__(self):
-        radius = check_number(self.apex_radius, "apex_radius", above=0, at_most=_LONGEST, unit="nm")
-        length = check_number(self.shank_length, "shank_length", above=0, at_most=_LONGEST, unit="nm")
-        angle = check_number(self.shank_angle, "shank_angle", at_least=0, below=45, unit="degrees")
-        check_choice(self.base, "base", ("rounded", "flat"))
-        for name, value in (("apex_radius", radius), ("shank_length", length), ("shank_angle", angle)):
-            object.__setattr__(self, name, value)
+    apex_radius: float = number("Radius R of the cap", above=0, at_most=_LONGEST, unit="nm")
+    shank_length: float = number("Length L of the shank", above=0, at_most=_LONGEST, unit="nm")
+    shank_angle: float = number(
+        "Half the opening angle alpha of the shank", default=1.5, at_least=0, below=45, unit="degrees"
+    )
+    base: str = choice("Form of its lower end", ("rounded", "flat"), default="rounded")
 
     @property
     def _flank(self):

@@ -12,7 +12,7 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError, read_small_file, replace_file, sha256_of
 from apt_evap._common.kept import check_made_from
 from apt_evap._common.validation import short_text
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 
 RECORD = "twin.json"
 _LARGEST = 1 << 24  # bytes

@@ -14,24 +14,7 @@ from apt_evap.simulation.run import Run
 
 
 def settings_of_maps(run: Run, perturbations: Sequence[Perturbation] = ()) -> MapSettings:
-    """Settings of the maps of a run.
-
-    Parameters
-    ----------
-    run : Run
-        The run.
-    perturbations : sequence of perturbation
-        One panel for each; by default those of the settings of the run, or of its flights.
-
-    Returns
-    -------
-    MapSettings
-
-    Raises
-    ------
-    ValueError
-        If the settings of the run name a class that is not known.
-    """
+    """Settings of the maps of a run."""
     stored = run.provenance.get("maps", {})
     if perturbations:
         panels = tuple(map(Panel, perturbations))

@@ -43,15 +43,7 @@ class MeasuredSource:
 
 
 def source_of(measured: MeasuredSource | Hits | DetectorMap | AnyPath, distance: float | None = None) -> MeasuredSource:
-    """Source of a measurement: of a path, with its flight length if masses follow from it, of ions or of a map.
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read.
-    ValueError
-        If it is something else.
-    """
+    """Source of a measurement: of a path, with its flight length if masses follow from it, of ions or of a map."""
     if isinstance(measured, MeasuredSource):
         return measured
     if isinstance(measured, Hits | DetectorMap):

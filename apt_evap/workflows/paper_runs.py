@@ -14,8 +14,8 @@ from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.workflows.advice import advice_as_notes
 from apt_evap.workflows.simulate_file import simulate
-from apt_evap.workflows.twin_of_map import advice_as_notes
 
 RUNS = "runs"
 """Folder of the runs and their settings."""
@@ -224,13 +224,7 @@ class PaperRuns:
         return self._loaded.get(run)
 
     def get(self, case: PaperCase, role: str) -> Run:
-        """One of the runs, which is simulated if it is not there.
-
-        Raises
-        ------
-        KeyboardInterrupt
-            If it is interrupted; the ions so far are kept.
-        """
+        """One of the runs, which is simulated if it is not there."""
         run = PaperRun(case, role)
         if (kept := self._kept(run)) is not None:
             return kept

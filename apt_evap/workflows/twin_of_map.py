@@ -3,21 +3,18 @@
 import json
 import os
 import shlex
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from apt_evap._common.codec import checked, choice, from_plain, number, settings, to_plain, vector
-from apt_evap._common.files import FileError, check_path, sha256_of
+from apt_evap._common.codec import from_plain, to_plain
+from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_kind, check_number, check_sequence
-from apt_evap.config.lens_text import read_lens
+from apt_evap._common.validation import check_kind
 from apt_evap.config.material_text import write_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -43,113 +40,22 @@ from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.specimen.materials import Material, as_material
-from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.warnings import MapWarning, warn
+from apt_evap.workflows.advice import advice_as_notes
 from apt_evap.workflows.compare_maps import IN_LINES, REPORT, compare
+from apt_evap.workflows.indexing_record import IndexingRecord
 from apt_evap.workflows.kept_files import KeptFiles
 from apt_evap.workflows.measured_source import MeasuredSource, source_of
 from apt_evap.workflows.simulate_file import no_note, simulate
+from apt_evap.workflows.twin_options import TwinOptions
 
 SETTINGS, FACTS, RUN, REGISTRATION, STUDY, ANSWER = (
     "specimen.toml", "start.json", "run.h5", "registration.json", "study", "answer.txt",
 )  # fmt: skip
 _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
+_HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
 _BINS = 128  # of a map of ions
-
-
-def _text(value, name):
-    return check_kind(value, name, str, "a text")
-
-
-def _texts(value, name):
-    return tuple(_text(line, name) for line in check_sequence(value, name, "texts"))
-
-
-def _candidates(value, name):
-    if not value:
-        raise ValueError(f"{name} must have at least one candidate, got none")
-    return tuple(value)
-
-
-def _read_candidates(plain, name):
-    return [
-        from_plain(candidate, _Candidate, what="a candidate") for candidate in check_sequence(plain, name, "tables")
-    ]
-
-
-@settings
-class _Candidate:
-    """A candidate, as it is in start.json."""
-
-    axis: tuple = vector("Crystal direction along the axis of the specimen", 3)
-    rotation: float = number("Rotation about the axis", unit="degrees")
-    scale: float = number("Scale of the map", above=0, unit="mm/rad")
-    centre: tuple = vector("Place of the axis", 2, unit="mm")
-    score: float = number("Explained fraction of the structure", at_least=0, at_most=1)
-    confidence: float = number("Confidence", at_least=0, at_most=1)
-    rolled: float = number("Part of the pattern of ions that roll up", at_least=0, at_most=1)
-    contrast: float = number("Sum of the amplitudes", at_least=0)
-    angle_error: float = number("Standard error of the orientation", at_least=0, unit="degrees")
-    pattern_radius: float = number("Radius of the tip of the pattern", above=0, unit="nm")
-    barrel: float = number("Barrel term of the lens", default=0.0, unit="1/rad^2")
-    rim_change: float = number("Relative change of the scale from the centre to the rim", default=0.0)
-
-
-@settings
-class _Facts:
-    """Result of the first step, as it is in start.json."""
-
-    verdict: str = choice("Verdict of the indexing", ("indexed", "undecided"))
-    reason: str = checked("Reason of the verdict", "str", _text)
-    simulated_radius: float = number("Radius of the simulated tip", above=0, unit="nm")
-    candidates: tuple = checked("Candidates", "tuple", _candidates, read=_read_candidates)
-    deciding_marks: tuple = checked("Marks that would decide", "tuple", _texts, read=lambda plain, _: plain)
-    radii: Any = checked("Radii of the specimen, which are in the settings, too", "list", lambda radii, _: radii)
-
-    @property
-    def best(self) -> _Candidate:
-        """The first candidate."""
-        return self.candidates[0]
-
-
-@dataclass(frozen=True)
-class _Options:
-    """What a twin is made with, beside the measurement."""
-
-    element: str | Material
-    minutes: float
-    lens: str | LocalElectrode | None
-    field_factor: float | None
-    distance: float | None
-    efficiency: float
-    scales: tuple[float, ...] | None
-    poles: tuple[Any, ...]
-    lines: tuple[Any, ...]
-    ranges: AnyPath | None
-
-    def __post_init__(self) -> None:
-        check_number(self.minutes, "minutes", above=0, unit="min")
-        check_number(self.efficiency, "efficiency", above=0, at_most=1)
-
-    @property
-    def electrode(self) -> LocalElectrode | None:
-        """The lens."""
-        return read_lens(self.lens) if isinstance(self.lens, str) else self.lens
-
-    @property
-    def read_ranges(self) -> Ranges | None:
-        """Ranges of mass."""
-        return None if self.ranges is None else read_ranges(self.ranges)
-
-    def to_plain(self) -> dict[str, Any]:
-        """Plain values of what changes a result, by the options of the command."""
-        values = {name: getattr(self, name) for name in ("minutes", "field_factor", "distance")}
-        values |= {"element": write_material(as_material(self.element))}
-        values |= {"efficiency": self.efficiency, "scales": self.scales, "lens": self.electrode}
-        values |= {"pole": self.poles or None, "line": self.lines or None}
-        record = {f"--{name.replace('_', '-')}": to_plain(value) for name, value in values.items()}
-        return record | {"file of --ranges": None if self.ranges is None else sha256_of(self.ranges)}
 
 
 class Twin:
@@ -168,7 +74,7 @@ class Twin:
         self,
         folder: Path,
         source: MeasuredSource,
-        options: _Options,
+        options: TwinOptions,
         *,
         threads: int | None,
         progress: Any,
@@ -248,7 +154,7 @@ class Twin:
             field_factor=options.field_factor,
             distance=options.distance,
             efficiency=options.efficiency,
-            ranges=options.read_ranges,
+            ranges=None if options.ranges is None else read_ranges(options.ranges),
         )
 
     @cached_property
@@ -363,8 +269,8 @@ class Twin:
             )
 
     @cached_property
-    def _facts(self) -> _Facts:
-        return self._read(FACTS, _Facts, "the result of the first step")
+    def _facts(self) -> IndexingRecord:
+        return self._read(FACTS, IndexingRecord, "the result of the first step")
 
     def _read(self, name, kind, what):
         try:
@@ -407,7 +313,7 @@ class Twin:
 
     def _reconstruct_command(self, study):
         """Command that reconstructs with the constants, "" if they are in doubt, or without file or flight length."""
-        known, file, lens = self._known(study).arguments, self._source.file, self._options.lens
+        known, file, lens = self._known(study).arguments, self._source.file, self._options.lens_text
         if "distance" not in known or file is None:
             return ""
         element = write_material(as_material(self._options.element))
@@ -418,7 +324,7 @@ class Twin:
                 # masses follow from the flight length
                 value = f"{known[name]}" if name in ("projection", "distance") else f"{known[name]:.4g}"
                 words += [f"--{name.replace('_', '-')}", value]
-        words += [] if lens is None else ["--lens", lens if isinstance(lens, str) else _lens_text(lens)]
+        words += ["--lens", lens] if lens else []
         return shlex.join(words)
 
     def _made_answer(self):
@@ -441,34 +347,6 @@ class Twin:
         if command := self._reconstruct_command(self.study):
             lines.append(f"reconstruct with: {command}")
         return ("\n".join(lines) + "\n").encode(errors="backslashreplace")
-
-
-_HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
-
-
-@contextmanager
-def advice_as_notes(note: Callable[[str], None]) -> Iterator[None]:
-    """Give warnings with an advice as notes without it: the user of a twin has not chosen its settings."""
-    show = warnings.showwarning
-
-    def tell(message: Any, category: Any, *where: Any, **options: Any) -> None:
-        fact = getattr(message, "fact", "")
-        if fact and fact != str(message):
-            note(f"note: {fact}")
-        else:
-            show(message, category, *where, **options)
-
-    warnings.showwarning = tell
-    try:
-        yield
-    finally:
-        warnings.showwarning = show
-
-
-def _lens_text(lens):
-    """Text of a lens for the option of a command."""
-    changes = {name: value for name, value in to_plain(lens).items() if name != "name" and value is not None}
-    return f"local-electrode:{','.join(f'{name}={value!r}' for name, value in changes.items())}"
 
 
 def twin(
@@ -555,7 +433,7 @@ def twin(
     PosixPath('R5083_twin/study/report.html')
     """
     source = source_of(measured, distance)
-    options = _Options(
+    options = TwinOptions(
         element=element,
         minutes=minutes,
         lens=lens,

@@ -10,7 +10,7 @@ from typing import Any
 from apt_evap import plot
 from apt_evap._common.files import FileError, check_path, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -76,22 +76,7 @@ def is_picture(path: Path) -> bool:
 
 
 def check_output(path: AnyPath, is_ours: Callable[[Path], bool], overwrite: bool) -> None:
-    """Check that a file can be written, and that no file of another program would be overwritten.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    is_ours : callable
-        Whether an existing file was made by this package.
-    overwrite : bool
-        Whether a file of another program may be replaced.
-
-    Raises
-    ------
-    FileError
-        If it cannot be written, or would replace a file of another program.
-    """
+    """Check that a file can be written, and that no file of another program would be overwritten."""
     target = Path(os.path.realpath(path))
     try:
         if target.is_dir():

@@ -14,9 +14,13 @@ from apt_evap.cli._explorer_of_files import explorer_and_view
 from apt_evap.cli._files import file_of, measured_of, measured_source, note, read
 from apt_evap.cli.parser import make_parser
 from apt_evap.io.measured_file import MeasuredFile
-from apt_evap.workflows.twin_of_map import Twin, _Options
+from apt_evap.workflows.twin_of_map import Twin
+from apt_evap.workflows.twin_options import TwinOptions
 
-pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")  # ions outside grids and ranges
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning"),  # ions outside grids and ranges
+    pytest.mark.usefixtures("spectra_once"),
+]
 N = 20_000
 ABUNDANCES = (0.6808, 0.2622, 0.0114, 0.0363, 0.0093)  # of nickel
 # words of the file and of one option; all others are as if they were not given
@@ -138,7 +142,7 @@ def test_the_command_of_a_twin_reconstructs_its_ions(folder, words, monkeypatch,
     options = parsed("twin", *words)
     known = {"distance": options.distance or 90.0, "efficiency": 0.4}
     monkeypatch.setattr(Twin, "_known", lambda self, study: SimpleNamespace(arguments=known))
-    chosen = _Options("Ni", 1.0, None, None, options.distance, 0.5, None, (), (), None)
+    chosen = TwinOptions("Ni", 1.0, None, None, options.distance, 0.5, None, (), (), None)
     how = {"threads": 1, "progress": False, "note": note, "command": ""}
     twin = Twin(tmp_path / "t", measured_source(options), chosen, **how)
     command = shlex.split(twin._reconstruct_command(None))

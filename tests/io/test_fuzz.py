@@ -115,7 +115,7 @@ def test_the_samples_are_good(tmp_path, suffix):
 def test_cut_anywhere(tmp_path, suffix, partial):
     data = SAMPLES[suffix]
     options = {"partial": True} if partial and suffix not in (".h5", *RANGE_FORMATS) else {}
-    for size in range(0, len(data), 1 if len(data) < 600 else 7):
+    for size in range(0, len(data), 1 if len(data) < 200 else 11):
         check(save(tmp_path, data[:size], suffix), **options)
 
 

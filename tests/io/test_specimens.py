@@ -178,6 +178,17 @@ def test_what_ase_reads(save, tmp_path):
     assert set(other.get_chemical_symbols()) == {"H", "He"}  # what is refused here
 
 
+def test_a_poscar_with_more_atoms_than_bytes_is_refused_before_they_are_listed(tmp_path):
+    ase = pytest.importorskip("ase")
+    path = tmp_path / "POSCAR"
+    ase.Atoms("Al8Cu4", positions=PLACES, cell=[10, 10, 10]).write(path, format="vasp")
+    lines = path.read_text().splitlines(keepends=True)
+    assert lines[6].split() == ["8", "4"]
+    path.write_text("".join([*lines[:6], " 8  49976020537\n", *lines[7:]]))
+    with pytest.raises(FileError, match=r"POSCAR', line 7: expected the numbers of the atoms, got '8 49976020537' in"):
+        ae.read_tip(path)
+
+
 @pytest.mark.parametrize("name", ["a@1.xyz", "a@all.xyz", "-", "a*.xyz"])
 def test_names_that_ase_would_interpret(save, tmp_path, monkeypatch, name):
     """With "a@1.xyz", ASE reads a part of the file "a"."""

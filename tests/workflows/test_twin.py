@@ -19,8 +19,10 @@ from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.warnings import warn
 from apt_evap.workflows import kept_files, twin_of_map
+from apt_evap.workflows.advice import advice_as_notes
 from apt_evap.workflows.kept_files import RECORD, KeptFiles
-from apt_evap.workflows.twin_of_map import Twin, _Options
+from apt_evap.workflows.twin_of_map import Twin
+from apt_evap.workflows.twin_options import TwinOptions
 
 ARGUMENTS = ("--element", "Ni", "--scales", "56,64")
 
@@ -276,7 +278,7 @@ def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
 def test_ions_of_the_peaks_are_not_all_ions(quick, capsys):
     """The command selects those of the crystal, the function takes all; and off is not the same as not given."""
     source = measured_source(make_parser("twin").parse_args(["twin", "ni.epos", *ARGUMENTS]))
-    chosen = _Options("Ni", 10.0, None, None, None, 0.5, (56.0, 64.0), (), (), None)
+    chosen = TwinOptions("Ni", 10.0, None, None, None, 0.5, (56.0, 64.0), (), (), None)
     how = {"threads": 1, "progress": False, "note": print, "command": ""}
     Twin(Path("t"), source, chosen, **how)._kept.write({"answer.txt": b"an answer"})
     with pytest.raises(ae.FileError, match=r"'t' was made with --all-ions = 'no, those of Ni', but True is asked for"):
@@ -365,7 +367,7 @@ def test_a_twin_takes_as_many_bins_as_the_run_has_ions_for():
 
 def test_an_advice_on_the_settings_of_a_twin_is_a_note():
     told = []
-    with warnings.catch_warnings(), twin_of_map.advice_as_notes(told.append):
+    with warnings.catch_warnings(), advice_as_notes(told.append):
         warnings.simplefilter("always")
         warn("12 ions are inexact", ae.warnings.ResponseWarning, "use a smaller energy_limit")
     assert told == ["note: 12 ions are inexact"]

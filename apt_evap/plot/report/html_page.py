@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from apt_evap._common.files import FileError, read_small_file, replace_file
 from apt_evap._common.types import AnyPath
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 
 DPI = 100
 """Resolution of the pictures [dots per inch]: a study with five maps takes about 1 MB."""

@@ -12,7 +12,7 @@ import matplotlib
 
 from apt_evap._common.files import check_path, open_for_reading
 from apt_evap._common.types import AnyPath
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.plot.report.html_page import Page, collapsed, escape, table, text_of
 from apt_evap.simulation.provenance import system
 

@@ -15,7 +15,7 @@ from apt_evap import plot
 from apt_evap._common.files import FileError, replace_file, sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count
-from apt_evap._version import __version__
+from apt_evap._common.version import __version__
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import described
 from apt_evap.fit.tips import TipFit, fit_tips
