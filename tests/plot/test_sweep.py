@@ -79,7 +79,11 @@ def test_points_without_a_study(tmp_path):
     seen = Reader((tmp_path / "s.html").read_text())
     assert "2 points, all complete." in seen.text and "SSIM" not in seen.text and "Message" not in seen.text
     assert seen.all("tr", "best") == []
-    assert seen.text.index("Point seed a 0 b 1") > 0
+    assert seen.text.index("seed Point 0 a 1 b") > 0
+    points = [SweepRow(name, {"radius": 5.0, "seed": seed}, {"ions": 100}) for seed, name in enumerate("ab")]
+    ae.plot.write_sweep(points, tmp_path / "t.html")
+    seen = Reader((tmp_path / "t.html").read_text())  # what is alike for all is said once
+    assert "seed Point 0 a 1 b" in seen.text and "radius 5; ions 100" in seen.text
 
 
 def test_a_sweep_without_points_is_refused(tmp_path):

@@ -119,6 +119,8 @@ def write_sweep(
     page.add(paragraph(f"{points}, {failed} of them incomplete." if failed else f"{points}, all complete."))
     compared = any(row.study for row in rows)
     page.add(heading("Points"), _table(rows, compared))
+    if same := _same(rows):
+        page.add(paragraph("The same for all points: " + "; ".join(f"{name} {value}" for name, value in same.items())))
     if compared:
         page.add(
             paragraph(
@@ -197,18 +199,31 @@ def _short(row):
 
 
 def _table(rows, compared):
-    settings, results = (_names(getattr(row, part) for row in rows) for part in ("settings", "results"))
+    same = _same(rows)
+    settings, results = (
+        [name for name in _names(getattr(row, part) for row in rows) if name not in same]
+        for part in ("settings", "results")
+    )
     of_study = [_score_name([row for row in rows if row.study]), *_STUDY] if compared else []
     lines = []
     for row in rows:
         cells = [text_of(row.settings.get(name)) for name in settings]
         cells += [text_of(row.results.get(name)) for name in results]
         cells += _study_cells(row) * compared
-        lines.append((row.name, *cells, row.message))
-    head = ["Point", *settings, *results, *of_study, "Message"]
+        lines.append((*cells, row.name, row.message))
+    head = [*settings, *results, *of_study, "Point", "Message"]
     if not any(row.message for row in rows):
         head, lines = head[:-1], [line[:-1] for line in lines]
     return table(lines, head, best=0 if any(row.alike for row in rows) else None)
+
+
+def _same(rows):
+    """Settings and results that all of several points have alike, as texts."""
+    if len(rows) < 2:
+        return {}
+    values = {name: {text_of(row.settings.get(name)) for row in rows} for name in _names(row.settings for row in rows)}
+    values |= {name: {text_of(row.results.get(name)) for row in rows} for name in _names(row.results for row in rows)}
+    return {name: next(iter(texts)) for name, texts in values.items() if len(texts) == 1}
 
 
 def _study_cells(row):
