@@ -1,27 +1,26 @@
 """Maps of a run for any emission, on the bins of a measured map: the numbers of the explorer, without its page."""
 
 import math
-import shlex
 import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from apt_evap._common.codec import to_python
-from apt_evap._common.validation import check_array, check_count, check_kind, check_number, check_sequence
+from apt_evap._common.validation import check_array, check_count, check_kind, check_number
 from apt_evap.analysis.apex import image_compression
-from apt_evap.config.perturbation_text import write_perturbation
-from apt_evap.detection.binning import MAX_BINS, bins_for, field_of_view
+from apt_evap.detection.binning import bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
+from apt_evap.explore.explorer_maps import ExplorerMaps, ExplorerSettings
+from apt_evap.explore.explorer_text import Commands, ExplorerText
 from apt_evap.explore.marks import Overlay, overlay
 from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.explore.placement import misplaced
@@ -37,7 +36,7 @@ from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
 from apt_evap.maps.registration.register import Registration, register
 from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.maps.rings import Ring, ring_statistics
-from apt_evap.maps.similarity import WINDOW, Similarity, similarity, similarity_ceiling, window_fits
+from apt_evap.maps.similarity import WINDOW, similarity, similarity_ceiling, window_fits
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
 
@@ -50,99 +49,6 @@ _FAMILIES = 6  # of poles over the maps
 _NEAR = 15.0  # degrees: a pole farther from the axis of the specimen is not that of its apex
 
 
-@dataclass(frozen=True)
-class ExplorerSettings:
-    """Settings of the maps of the explorer.
-
-    Parameters
-    ----------
-    perturbation : perturbation
-        Emission of the ions.
-    bins : int
-        Bins along the longer side; with a measured map, its bins are merged to come closest to this number.
-    smoothing : float
-        Standard deviation of the Gaussian that smooths both maps [mm]; 0 for none.
-    flattening : float
-        Standard deviation of the Gaussian that flattens both maps before [mm]; 0 for none.
-    ions : tuple of int, optional
-        First ion, and the one after the last, in the sequence of evaporation; by default all.
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-    """
-
-    perturbation: Perturbation
-    bins: int
-    smoothing: float
-    flattening: float = 0.0
-    ions: tuple[int, int] | None = None
-
-    def __post_init__(self):
-        check_count(self.bins, "bins", at_least=1, at_most=MAX_BINS)
-        for name in ("smoothing", "flattening"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, at_least=0, unit="mm"))
-        if self.ions is not None:
-            first, last = check_sequence(self.ions, "ions", "(first, last)")
-            first = check_count(first, "first ion")
-            object.__setattr__(self, "ions", (first, check_count(last, "last ion", at_least=first + 1)))
-
-
-@dataclass(frozen=True, eq=False)
-class ExplorerMaps:
-    """Maps of the explorer, and the numbers that compare them.
-
-    Parameters
-    ----------
-    settings : ExplorerSettings
-        Settings of the maps.
-    simulated : DetectorMap or None
-        Counts of the simulated ions, in the measured frame if there is a measured map; None without a run.
-    measured : DetectorMap or None
-        The measured map, with a run within the region that both maps cover.
-    pictures : tuple of DetectorMap
-        The same maps flattened and smoothed; without those that are None.
-    whole : DetectorMap or None
-        The complete measured map, flattened and smoothed.
-    similarity : Similarity or None
-        `similarity` of both maps; None without a measured map or with too few bins.
-    ceiling : Similarity or None
-        `similarity_ceiling` of the measured counts, for comparison; None for densities and for flattened maps.
-    ions : int
-        Number of simulated ions, including those outside the map.
-    preview : bool
-        Whether these are only a part of the ions of the settings.
-    seconds : float
-        Duration of the computation [s].
-    notes : tuple of str
-        Texts of the warnings.
-    """
-
-    settings: ExplorerSettings
-    simulated: DetectorMap | None
-    measured: DetectorMap | None
-    pictures: tuple[DetectorMap, ...]
-    whole: DetectorMap | None
-    similarity: Similarity | None
-    ceiling: Similarity | None
-    ions: int
-    preview: bool
-    seconds: float
-    notes: tuple[str, ...]
-
-    @property
-    def width(self) -> float:
-        """Longer side of the maps [mm]."""
-        left, right, lower, upper = self.pictures[0].extent
-        return max(right - left, upper - lower)
-
-    @property
-    def bin_size(self) -> float:
-        """Longer side of a bin [mm]."""
-        return max(self.pictures[0].bin_size)
-
-
 class Pole(NamedTuple):
     """Pole near the axis of a specimen."""
 
@@ -152,15 +58,6 @@ class Pole(NamedTuple):
     """Position on the map [mm]."""
     fold: int
     """Rotational symmetry of the poles about it."""
-
-
-class Commands(NamedTuple):
-    """Text that repeats what the explorer shows."""
-
-    shell: str
-    """Command line."""
-    python: str
-    """Python lines; the maps are `simulated` and `measured`, a selection of ions is `hits`."""
 
 
 class Explorer:
@@ -270,7 +167,7 @@ class Explorer:
     @property
     def names(self) -> tuple[str, str]:
         """Files of the run and of the measurement, empty without one."""
-        first, second = (words[0] if words else "" for words in (self._run_arguments, self._measured_words))
+        first, second = (words[0] if words else "" for words in (self._run_arguments, self.words_of_measurement))
         return first, second
 
     # ---- maps ------------------------------------------------------------------------------------------------------
@@ -738,61 +635,21 @@ class Explorer:
     # ---- text ------------------------------------------------------------------------------------------------------
 
     def commands(self, settings: ExplorerSettings) -> Commands:
-        """Command line and Python lines that give the same maps.
-
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Settings of the maps.
-
-        Returns
-        -------
-        Commands
-        """
-        # a picture of `map` is neither registered nor flattened
-        one = self.measured is None or self.run is None
-        command = "map" if one and not settings.flattening else "explore"
-        # options of the run follow both files
-        shell = ["apt-evap", command, *self._run_arguments[:1], *self._measured_words, *self._run_arguments[1:]]
-        shell += self._shell_options(settings, command)
-        if settings.flattening:
-            shell += ["--flatten", repr(settings.flattening)]
-        if self.registered and self.registration is not None:
-            shell += [f"--registration={self.registration.to_text()}"]
-        return Commands(shlex.join(shell), "\n".join([*self._python_hits(settings), *self._python_maps(settings)]))
+        """Command line and Python lines that give the same maps."""
+        return ExplorerText(self).commands(settings)
 
     def selection(self, settings: ExplorerSettings, x: tuple[float, float], y: tuple[float, float]) -> Commands:
-        """Command line and Python lines that select the ions within a rectangle on the map.
-
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Settings of the maps.
-        x, y : tuple of float
-            Bounds of the rectangle [mm].
-
-        Returns
-        -------
-        Commands
-            Of the measured ions if there are any, else of the run. `hits` are the simulated ions in both cases. An
-            empty command line for a measured map, which has no ions.
-        """
-        bounds = tuple(float(f"{value:.6g}") for value in (*sorted(x), *sorted(y)))
-        box = f"--box={','.join(map(repr, bounds))}"
-        window = f".window(x=({bounds[0]!r}, {bounds[1]!r}), y=({bounds[2]!r}, {bounds[3]!r}))"
-        python = [*self._python_hits(settings)]
-        if self.run is not None:
-            python[-1] += window
-        shell = ""
-        if self.measured is None:
-            shell = shlex.join(["apt-evap", "map", *self._run_arguments, *self._shell_options(settings, "map"), box])
-        elif isinstance(self.measured, Hits):
-            shell = shlex.join(["apt-evap", "map", *self._measured_words, box])
-            python.append(f"measured = {self._code_of_measured}{window}")
-        return Commands(shell, "\n".join(python))
+        """Command line and Python lines that select the ions within a rectangle on the map, see `ExplorerText`."""
+        return ExplorerText(self).selection(settings, x, y)
 
     @property
-    def _measured_words(self):
+    def words_of_run(self) -> list[str]:
+        """Arguments of a command line that name the run, empty without one."""
+        return self._run_arguments
+
+    @property
+    def words_of_measurement(self) -> list[str]:
+        """Arguments of a command line that name the measurement and its selection, empty without one."""
         if isinstance(self.ions_of_file, MeasuredIons):
             return self.ions_of_file.arguments
         if self.measured is None:
@@ -800,54 +657,11 @@ class Explorer:
         return ["MEASURED"] if self._map_file is None else self._map_file.words()
 
     @property
-    def _code_of_measured(self):
+    def code_of_measurement(self) -> str:
+        """Python expression of the measurement."""
         if isinstance(self.ions_of_file, MeasuredIons):
             return self.ions_of_file.code
         return "measured" if self._map_file is None else self._map_file.code(())
-
-    def _shell_options(self, settings, command):
-        options = [] if self.run is None else ["--perturbation", write_perturbation(settings.perturbation)]
-        options += ["--bins", str(settings.bins), "--smooth", repr(settings.smoothing)]
-        if settings.ions is not None:
-            # --ions of `explore` selects measured ions
-            options += ["--ions" if command == "map" else "--simulated", "{},{}".format(*settings.ions)]
-        return options
-
-    def _python_hits(self, settings):
-        if self.run is None:
-            return ["import apt_evap as ae", ""]
-        lines = ["import apt_evap as ae", "", f"run = {self.run_code}"]
-        hits = f"run.hits({to_python(settings.perturbation)})"
-        if self.registration is not None:
-            r = self.registration
-            lines.append(f"registration = ae.Registration({r.rotation!r}, {r.scale!r}, {r.shift!r}, {r.mirror!r})")
-            hits = f"registration.hits({hits})"
-        window = "" if settings.ions is None else f".window(ion={settings.ions!r})"
-        return [*lines, f"hits = {hits}{window}"]
-
-    def _python_maps(self, settings):
-        if self.measured is None:
-            lines = [f"simulated = hits.map(like=run.grid({settings.bins}), position_step=None)"]
-            names = ["simulated"]
-        else:
-            arguments = (
-                f"None, {self._code_of_measured}"
-                if self.run is None
-                else f"run, {self._code_of_measured}, registration"
-            )
-            lines = [
-                "from apt_evap.explore.explorer import Explorer",
-                f"measured = Explorer({arguments}).bins_like({settings.bins})",
-            ]
-            names = ["measured"]
-            if self.run is not None:
-                lines.append("simulated = hits.map(like=measured, position_step=None)")
-                names = ["simulated", "measured"]
-        flat = f".flattened({settings.flattening!r})" if settings.flattening else ""
-        if len(names) > 1:
-            lines.append(f"print(ae.similarity(simulated{flat}, measured{flat}, smoothing={settings.smoothing!r}))")
-        pictures = ", ".join(f"{name}{flat}.smoothed({settings.smoothing!r})" for name in names)
-        return [*lines, f"ae.plot.detector_maps([{pictures}])[0].figure.savefig('maps.png')"]
 
 
 def _registration(simulated, measured, options):

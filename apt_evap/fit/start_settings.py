@@ -52,6 +52,7 @@ _VOLTAGE = 1000.0  # V, of a simulation
 # flagged with 5 eV, 1,956 with 12.7
 _LIMITS = 1.5, 5.0
 _FEWEST, _MOST = 10_000, 150_000  # ions
+_FILLED = 0.95  # of the time that is used at least, if the bounds of the ions allow it
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,9 +222,15 @@ def settings_of(
     radius = math.nan if math.isnan(radii[0]) else sum(radii) / 2
     sizes = [size for size in RADII if not size * material.a > radius] or [RADII[-1]]
     for size in sizes:
-        text = _text(indexing, radii, size, lens, factors)
-        needs = estimate_cost(config_of(tomllib.loads(text), Path("settings.toml")), threads)
+        text, needs = _costed(indexing, radii, size, lens, factors, threads)
         if needs.hours is not None and needs.hours <= budget:
+            more = 1.0
+            while needs.hours < _FILLED * budget:  # more ions, up to the bounds of the shape
+                more *= budget / needs.hours
+                before = needs.ions
+                text, needs = _costed(indexing, radii, size, lens, factors, threads, more)
+                if needs.ions == before:
+                    break
             break
     else:
         raise ValueError(
@@ -264,12 +271,18 @@ def _radii(hits, field, lens, factor):
     return float(lens.radius(ends[0], field)), float(lens.radius(ends[1], field))
 
 
-def _text(indexing, radii, size, lens, factors):
-    """The settings file."""
+def _costed(indexing, radii, size, lens, factors, threads, more=1.0):
+    """The settings file, and the cost of its run."""
+    text = _text(indexing, radii, size, lens, factors, more)
+    return text, estimate_cost(config_of(tomllib.loads(text), Path("settings.toml")), threads)
+
+
+def _text(indexing, radii, size, lens, factors, more):
+    """The settings file; `more` times as many ions as a lattice constant of the cap has."""
     best = indexing.best
     material, projection = best.orientation.material, best.projection
     atoms = atom_density(material.structure, material.a, material.c) * material.a**3
-    layers = 2 * math.pi * atoms * size**2  # a lattice constant of the cap
+    layers = 2 * math.pi * atoms * size**2 * more  # a lattice constant of the cap
     ions = int(min(max(layers, _FEWEST), _PART * 2 / 3 * math.pi * atoms * size**3, _MOST))
     disc = disc_of(indexing.map)
     x, y = np.meshgrid(*indexing.map.centres)
