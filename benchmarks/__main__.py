@@ -5,6 +5,7 @@ words with this table. One thread; processor time counts, so that a busy machine
 """
 
 import argparse
+import contextlib
 import csv
 import os
 import subprocess
@@ -40,7 +41,7 @@ def processor_seconds(words, folder):
     }  # fmt: skip
     before = os.times()
     process = subprocess.run(
-        [sys.executable, "-m", "apt_evap.cli", *words], cwd=folder, env=environment, capture_output=True, text=True
+        [sys.executable, "-m", "apt_evap", *words], cwd=folder, env=environment, capture_output=True, text=True
     )
     after = os.times()
     spent = after.children_user + after.children_system - before.children_user - before.children_system
@@ -53,12 +54,13 @@ def main(arguments=None):
     """Measure all commands, or those whose names contain a text, and write the table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("names", nargs="*", help="parts of names; default: all")
+    parser.add_argument("--folder", help="where the commands run and leave their files; default: a temporary one")
     options = parser.parse_args(arguments)
     known = {}
     if TABLE.exists():
         with TABLE.open(newline="") as file:
             known = {row["command"]: row["processor_seconds"] for row in csv.DictReader(file)}
-    with tempfile.TemporaryDirectory() as folder:
+    with contextlib.nullcontext(options.folder) if options.folder else tempfile.TemporaryDirectory() as folder:
         subprocess.run(
             [sys.executable, "-c", "from apt_evap.explore.start_page import write_example; write_example()"],
             cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True,
