@@ -20,6 +20,7 @@ from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io._points import is_data
 from apt_evap.io._texts import read_head, read_text, without_compression
 from apt_evap.io.apt import chunk_apt, read_apt
+from apt_evap.io.ato import read_ato
 from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
@@ -103,6 +104,7 @@ FORMATS = (
     Format(".pos", None, read_pos, write_pos, chunk_pos, POS, lambda name, _: name in POS),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),
     Format(".raw", None, read_raw, None, chunk_raw),
+    Format(".ato", None, read_ato),
     Format(".npz", b"PK", read_map),
     Format(".xyz", None, None, write_xyz, keeps=is_data),
     Format(".vtp", None, None, write_vtp, keeps=is_data),
@@ -118,7 +120,6 @@ _CAMECA = "raw files of CAMECA are not documented in public: export .epos or .ap
 _ADVICE = dict.fromkeys((".str", ".rhit", ".hits", ".root"), _CAMECA)
 _ADVICE |= dict.fromkeys(RANGE_FORMATS, "it contains ranges of mass: read_ranges and --ranges read it")
 _ADVICE |= {
-    ".ato": "those of Rouen have several layouts, and do not say which one it is: convert it to .epos",
     ".ops": "convert it to .epos, .pos or .apt",
 }
 

@@ -17,7 +17,7 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     Parameters
     ----------
     path : str or path-like
-        The file: .pos, .epos, .apt, .raw, .nxs, .h5 (a run, NXapm or PyCCAPT), .npz, or a result table of TAPSim.
+        The file: .pos, .epos, .apt, .raw, .ato, .nxs, .h5 (a run, NXapm or PyCCAPT), .npz, or a result table of TAPSim.
     format : str, optional
         Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional

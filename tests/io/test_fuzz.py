@@ -56,6 +56,7 @@ def samples():
         ".env": ENV.encode(),
         ".xrng": xrng((13.8, 14.2, 2, 0.02, [14]), (43.8, 44.2, 1, 0, [14, 8])).encode(),
         ".tapsim": tapsim_table(4)[0],
+        ".ato": np.array([0, 3], "<u4").tobytes() + np.linspace(1, 60, 56, dtype="<f4").tobytes(),
         ".h5": b"\x89HDF\r\n\x1a\n" + bytes(300),
     }
 
