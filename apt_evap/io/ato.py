@@ -7,6 +7,7 @@ versions, are not documented in public: the former are not read, the latter are 
 
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -70,5 +71,5 @@ def read_ato(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bo
             if fill(file, rows) < rows.nbytes:
                 raise TruncatedFile(f"{str(path)!r} became shorter during reading, expected {n} ions")
             values[start : start + len(rows)] = rows[:, :4]
-    read = {"positions": values[:, :3] * _NM_PER_ANGSTROM, "mass_to_charge": values[:, 3].copy()}
+    read: dict[str, Any] = {"positions": values[:, :3] * _NM_PER_ANGSTROM, "mass_to_charge": values[:, 3].copy()}
     return Hits(**{name: read[name] for name in chosen}, source=str(path))

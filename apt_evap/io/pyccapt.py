@@ -70,7 +70,8 @@ _TABLE = (  # columns of a calibration in their order, with those of `Hits`, and
     ("x_det (cm)", "x", 1 / _MM_PER_CM),
     ("y_det (cm)", "y", 1 / _MM_PER_CM),
 )
-_COUNTED = (("delta_p", "pulses"), ("multi", "multi"), ("start_counter", "start_counter"))  # integers
+_COUNTED = (("delta_p", "pulses", 1), ("multi", "multi", 1), ("start_counter", "start_counter", 1))  # integers
+_ROWS = 1 << 13  # of a chunk of the file
 KIND = "PyCCAPT"
 WRITTEN = ("positions", "mass_to_charge", "voltage", "pulse_voltage", "time_of_flight", "x", "y", "pulses")
 _CONTINUOUS = ("x", "y", "time_of_flight")  # integers are raw counts of the detector
@@ -239,14 +240,19 @@ def write_pyccapt(path: AnyPath, hits: Hits) -> None:
         columns["multi"] = np.zeros(len(hits), np.int64)
         columns["multi"][chosen] = np.repeat(ions[ions > 0], ions[ions > 0])
     n = len(hits.x[chosen])
-    numbers = np.zeros((n, len(_TABLE)))
-    for k, (_, name, factor) in enumerate(_TABLE):
-        if (values := columns.get(name)) is not None:
-            numbers[:, k] = values[chosen].astype(float) * factor
-    counts = np.zeros((n, len(_COUNTED)), np.int64)
-    for k, (_, name) in enumerate(_COUNTED):
-        if (values := columns.get(name)) is not None:
-            counts[:, k] = values[chosen]
+
+    def block(titles, dtype):
+        """Rows of a block of columns with their factors, in parts."""
+        parts = [(columns.get(name), factor) for _, name, factor in titles]
+        parts = [(None if values is None else values[chosen], factor) for values, factor in parts]
+        for start in range(0, n, _ROWS):
+            rows = np.zeros((min(_ROWS, n - start), len(titles)), dtype)
+            for k, (values, factor) in enumerate(parts):
+                if values is not None:
+                    part = values[start : start + len(rows)].astype(dtype)
+                    rows[:, k] = part if factor == 1 else part * factor
+            yield rows
+
     with write_hdf5(path, KIND, n) as file:
         group = file.create_group("df")
         names = [name for name, *_ in (*_TABLE, *_COUNTED)]
@@ -256,9 +262,16 @@ def write_pyccapt(path: AnyPath, hits: Hits) -> None:
         group.attrs["ndim"], group.attrs["nblocks"] = np.int64(2), np.int64(2)
         _put_array(group, "axis0", np.array(names, "S"), "string")
         _put_array(group, "axis1", np.arange(n), "integer")
-        for block, (values, titles) in enumerate(((numbers, names[: len(_TABLE)]), (counts, names[len(_TABLE) :]))):
-            _put_array(group, f"block{block}_items", np.array(titles, "S"), "string")
-            _put_array(group, f"block{block}_values", values)
+        for k, (titles, dtype) in enumerate(((_TABLE, np.float64), (_COUNTED, np.int64))):
+            _put_array(group, f"block{k}_items", np.array([title for title, *_ in titles], "S"), "string")
+            shape = (n, len(titles))
+            chunks = (min(n, _ROWS), len(titles))
+            values = group.create_dataset(
+                f"block{k}_values", shape, dtype, chunks=chunks, compression="gzip", compression_opts=0
+            )
+            for start, rows in enumerate(block(titles, dtype)):
+                values[start * _ROWS : start * _ROWS + len(rows)] = rows
+            _mark_array(values)
 
 
 def _label(path):
@@ -272,12 +285,17 @@ def _label(path):
 def _put_array(group, name, values, kind=None):
     """Write an array with the attributes of pandas."""
     dataset = put_field(group, name, values)
-    dataset.attrs["transposed"] = np.uint8(1)
-    _put_attributes(dataset, {"CLASS": "CARRAY", "TITLE": "", "VERSION": "1.1", "FLAVOR": "numpy"})
+    _mark_array(dataset)
     if kind:
         _put_attributes(dataset, {"kind": kind})
     if kind == "string":
         _put_attributes(dataset, {"nan_rep": "nan"})
+
+
+def _mark_array(dataset):
+    """Attributes of an array of pandas."""
+    dataset.attrs["transposed"] = np.uint8(1)
+    _put_attributes(dataset, {"CLASS": "CARRAY", "TITLE": "", "VERSION": "1.1", "FLAVOR": "numpy"})
 
 
 def _put_attributes(item, texts):
