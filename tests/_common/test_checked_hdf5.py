@@ -40,7 +40,7 @@ def refused(path, match=r"\.h5' is damaged", reader=ae.load):
 # ---- any damage ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("flips", [60, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("flips", [20, pytest.param(600, marks=pytest.mark.slow)])
 def test_every_changed_bit_is_noticed(path, run, flips):
     """Or it is in a gap of the file, in what only NeXus needs, or one of the five bits that pad a block of deflate."""
     whole, is_read = path.read_bytes(), np.zeros(path.stat().st_size, bool)

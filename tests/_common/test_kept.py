@@ -46,3 +46,8 @@ def test_the_digest_is_that_of_the_content():
     settings = ae.Instrument(efficiency=0.3)
     assert digest_of(settings) == digest_of(to_plain(settings)) == digest_of(dict(reversed(to_plain(settings).items())))
     assert digest_of(settings) != digest_of(ae.Instrument(efficiency=0.31))
+
+
+def test_rounding_of_a_sum_is_no_difference_and_another_number_is():
+    assert first_difference({"a": [0.1 + 0.2]}, {"a": [0.3]}) is None
+    assert first_difference({"a": [0.3]}, {"a": [0.3 * (1 + 1e-6)]})[0] == "a.0"

@@ -34,7 +34,8 @@ def test_a_warning_names_the_line_of_the_caller(tmp_path, small_tip):
 
 def test_no_module_filters_warnings_by_their_text():
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        source = path.read_text()
+        for node in ast.walk(ast.parse(source)) if "filterwarnings" in source else ():
             if isinstance(node, ast.Call) and ast.unparse(node.func) == "warnings.filterwarnings":
                 assert "message" not in [keyword.arg for keyword in node.keywords], f"{path}:{node.lineno}"
 

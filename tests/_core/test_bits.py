@@ -76,7 +76,8 @@ int main(void)
 """
 
 
-def test_bits_do_not_depend_on_the_processor(tmp_path):
+@pytest.mark.parametrize("levels", [("-O3",), pytest.param(("-O1", "-O3"), marks=pytest.mark.slow)], ids=" ".join)
+def test_bits_do_not_depend_on_the_processor(tmp_path, levels):
     compiler = shutil.which("gcc")
     if compiler is None:
         pytest.skip("needs gcc")
@@ -96,7 +97,7 @@ def test_bits_do_not_depend_on_the_processor(tmp_path):
         empty = [compiler, f"-march={processor}", "-fopenmp", "-E", "-x", "c", os.devnull]
         if subprocess.run(empty, capture_output=True).returncode:
             pytest.skip(f"gcc cannot build for {processor}")
-        for level in ("-O1", "-O3"):
+        for level in levels:
             build = [compiler, level, f"-march={processor}", *flags, "sums.c", "-o", "sums", "-lm"]
             built = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True)
             assert built.returncode == 0, built.stderr

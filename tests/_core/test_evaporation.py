@@ -64,6 +64,7 @@ def test_interior_is_free_of_field(thousand):
     assert inside.max() < 0.02 * emitter.fields.mean()
 
 
+@pytest.mark.slow
 def test_a_larger_patch_is_better(tip12):
     errors = []
     for radius in (2.5, 4.5, 7.07):

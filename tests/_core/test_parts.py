@@ -204,6 +204,7 @@ def test_when_only_the_whole_can_be_relaxed(tip12, small_tip):
     assert set(parts) == {0}
 
 
+@pytest.mark.slow
 def test_removed_atoms_are_those_of_the_events(tip12):
     emitter, other = (emitter_of(tip12, ae.Robin()) for _ in range(2))
     other.remove(evaporate(emitter, 150))
@@ -213,6 +214,7 @@ def test_removed_atoms_are_those_of_the_events(tip12):
         assert one == pytest.approx(two, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_fields_far_from_a_hole(tip12):
     """There, the changes of the patch act four by four: all fields as direct sums."""
     emitter = emitter_of(tip12, RULES[1], update_radius=40.0, opening_angle=0.1, sweep_interval=1000)

@@ -149,6 +149,7 @@ def test_rings_about_the_pole(tip20):
     assert len(peaks) == pytest.approx(radius * (1 - math.cos(math.radians(33))) / spacing, abs=1.5)
 
 
+@pytest.mark.slow
 def test_one_removed_atom_changes_its_neighbours_only(nickel):
     tip = ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
     emitter = ae.evaporation.Emitter(tip)

@@ -135,6 +135,7 @@ perturbation = { name = "RollUp", energy = 0.4 }
     assert len(ae.load("a.h5")) == 25
 
 
+@pytest.mark.slow
 def test_a_run_with_a_law_and_perturbations_of_ones_own(folder, capsys):
     text = """
 [law]

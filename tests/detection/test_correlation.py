@@ -7,6 +7,7 @@ from made_spectra import made
 
 import apt_evap as ae
 from apt_evap.detection import dissociation_line
+from apt_evap.spectra.dead_time import isotope_losses
 
 
 def test_pairs_are_those_of_a_loop():
@@ -25,6 +26,24 @@ def test_pairs_are_those_of_a_loop():
     numbers = np.bincount(np.bincount(pulse))[1:]
     assert pairs.pulses.tolist() == numbers.tolist()
     assert pairs.multiple_part == pytest.approx(1 - numbers[0] / 150)
+
+
+def test_too_many_pairs_are_counted_and_refused(monkeypatch):
+    monkeypatch.setattr("apt_evap.detection.correlation._MOST_PAIRS", 6)
+    ions = ae.Hits(mass_to_charge=np.arange(7.0) + 1, pulse_id=[0, 0, 0, 0, 1, 1, 2])
+    assert len(ions[:4].correlation().first) == 6  # of four ions
+    with pytest.raises(ValueError, match="at most 6 pairs, got 7: select fewer"):
+        ions.correlation()
+
+
+def test_the_error_of_a_loss_is_that_of_new_counts():
+    """1,000 draws of a tenth of the major isotope lost among multiples: known to 2 %."""
+    rng, minor = np.random.default_rng(3), np.array([1, 2])
+    alone, together = [8000.0, 1000.0, 500.0], [720.0, 100.0, 50.0]
+    counts = [(rng.poisson(alone).astype(float), rng.poisson(together).astype(float)) for _ in range(1000)]
+    parts, errors = np.transpose([isotope_losses(0, minor, *both, both) for both in counts])
+    assert parts.mean() == pytest.approx(0.1, abs=0.01)  # a ratio of counts has a bias
+    assert errors.mean() == pytest.approx(parts.std(), rel=0.1)
 
 
 def test_a_line_of_dissociation_goes_from_the_fragments_to_the_ion():

@@ -41,6 +41,7 @@ def test_an_independent_code(independent):
     np.testing.assert_allclose(np.array(found)[:, 1], np.array(known)[:, 1], rtol=0.01)  # it has no range of angles
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "known", "tolerance"),
     [
@@ -80,6 +81,7 @@ def test_a_table_of_a_prototype():
     np.testing.assert_allclose(np.transpose(compressions), known, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_trends():
     """Field factor and compression grow with the angle of the shank and fall with the radius."""
     settings = [LocalElectrode(40e3, 20e3, angle) for angle in (2.0, 12.0)]
@@ -101,6 +103,7 @@ def test_a_free_sphere_does_not_compress():
     np.testing.assert_allclose(flights.angles, [5.0, 20.0, 40.0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_doubling_the_panels(lens):
     once, twice = lens.lens(50.0), lens.lens(50.0, refinement=2)
     assert twice.field_factor == pytest.approx(once.field_factor, rel=1e-3)
@@ -293,6 +296,7 @@ def test_the_potential_of_the_detector(lens, drawn):
     assert turned.distance_from_axis(5.0, 40.0, energy, length) > straight / 10
 
 
+@pytest.mark.slow
 def test_the_range_of_the_compression_with_the_voltage(drawn):
     """With 4.3 kV at the detector the distances of hits change by 22 % between 2.2 and 9 kV."""
     low, high = drawn.distance_from_axis(10.0, 50.0, [2200.0, 9000.0], 100.0)
@@ -355,6 +359,7 @@ def test_a_plane_is_a_limit_of_cones():
     assert closer.field_factor < plane.field_factor
 
 
+@pytest.mark.slow
 def test_a_narrow_aperture_has_nearly_the_same_lens(lens):
     """Few ions pass it; the others are projected by a smooth continuation."""
     narrow, wide = LocalElectrode(40e3, 5e3, 5.0).lens(50.0), lens.lens(50.0)

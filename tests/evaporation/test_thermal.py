@@ -149,6 +149,7 @@ def probabilities(law, emitter):
     return rates / rates.sum()
 
 
+@pytest.mark.slow
 def test_all_barriers_choose_nearly_the_same_atoms(tip12):
     """Only C/kT at the working point matters: half of the summed differences is the share of other choices."""
     emitter, shares, more = emitter_of(tip12, ae.Extremal()), {barrier: [] for barrier in BARRIERS}, []
@@ -170,6 +171,7 @@ def test_all_barriers_choose_nearly_the_same_atoms(tip12):
     assert sorted(more)[1] > 0.15
 
 
+@pytest.mark.slow
 def test_the_spread_of_the_order_grows_with_the_temperature(tip12):
     spreads = [spread(tip12, ae.Arrhenius(temperature)) for temperature in (10.0, 30.0, 90.0)]
     # in proportion to kT/C, were there atoms at all fields
@@ -360,6 +362,7 @@ def test_the_mean_rate_is_the_wanted_one(tip12):
     assert rate == pytest.approx(control.rate, rel=1 / np.sqrt(n))  # the statistical error of n ions, 2.6 %
 
 
+@pytest.mark.slow
 def test_a_longer_memory_is_a_smoother_voltage(small_tip):
     noise = []
     for memory in (10, 50, 250):
@@ -486,6 +489,7 @@ def test_an_even_laser_is_a_higher_temperature(tip12):
     )  # of a laser, without a choice
 
 
+@pytest.mark.slow
 def test_more_ions_come_from_the_hot_side(tip12):
     fractions = []
     for asymmetry in (0.0, 1.0):

@@ -50,6 +50,7 @@ def test_errors_are_those_of_new_measurements(rng):
     assert told == pytest.approx(scatter, rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n, noise", [(12, 0.2), (40, 0.2), (40, 1.0)])
 def test_noise_is_not_fitted(rng, n, noise):
     """Of 200 sets of points without a distortion, 1 % per degree pass the test; the second guard lets fewer pass."""

@@ -66,7 +66,7 @@ def off(candidate, orientation, projection=None):
 @pytest.mark.parametrize(
     ("structure", "axis", "rotation", "rolled"),
     [
-        ("fcc", (0.30, 0.54, 0.79), 20.0, 1.0),
+        pytest.param(*("fcc", (0.30, 0.54, 0.79), 20.0, 1.0), marks=pytest.mark.slow),  # fast: `indexed_nickel`
         pytest.param(*("bcc", (0.10, 0.60, 0.80), 110.0, 0.0), marks=pytest.mark.slow),
         pytest.param(*("diamond", (0.35, 0.35, 0.87), -70.0, 0.6), marks=pytest.mark.slow),
         pytest.param(*("hcp", (2, 1, 2), 200.0, 0.3), marks=pytest.mark.slow),
@@ -468,6 +468,7 @@ def over_the_next(found):
     return 2 * np.log(first / max(second, 1e-300))
 
 
+@pytest.mark.slow
 def test_a_mixture_of_patterns_is_fitted_as_such():
     """A map of two patterns in equal parts: their amplitudes, and no others; the model is right for its counts."""
     patterns = master_patterns("fcc")

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.maps.profiles import Rectangle, azimuthal_profile, radial_profile, zone_line_profile
+from apt_evap.maps.profiles import Rectangle, azimuthal_profile, compare_profiles, radial_profile, zone_line_profile
 
 
 def disc(n, radius=10.0, seed=0):
@@ -39,11 +39,20 @@ def test_profiles_of_a_uniform_disc_scatter_as_poisson():
             radial_profile(source, outer=9, bins=60),
         ):
             pull = (profile.density - 1) / profile.error
-            # chi-square of 60 bins: 60 +- 11; 5 standard deviations
-            assert 5 < (pull**2).sum() < 115
+            # chi-square of 60 bins: 60 +- 11; errors that are twice too large give 15
+            assert 20 < (pull**2).sum() < 115
     # all hits inside 9 mm: the total density does not depend on how it is cut
     areas = np.pi * np.diff(np.linspace(0, 9, 61) ** 2)
     assert (radial_profile(hits, outer=9, bins=60).density * areas).sum() == pytest.approx(areas.sum())
+
+
+def test_two_profiles_of_one_density_differ_by_both_errors():
+    discs = (disc(40_000, seed=seed) for seed in (1, 2))
+    both = [azimuthal_profile(Hits(x=x, y=y), inner=2, outer=9, bins=200) for x, y in discs]
+    compared = compare_profiles(*both)
+    # chi-square of 200 bins: 10 %, three times
+    assert compared.chi_square / compared.degrees_of_freedom == pytest.approx(1, abs=0.3)
+    assert compared.relative < 0.05
 
 
 def test_profiles_of_densities_have_no_error():

@@ -54,7 +54,7 @@ def test_a_line_that_is_flat_in_its_middle(exponent):
     assert gaussian.exponent == 2 and gaussian.exponent_error == 0 and gaussian.chi_square > 100
 
 
-@pytest.mark.parametrize("n_fits", [60, pytest.param(300, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_fits", [30, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("height", [-0.8, 2.0])
 def test_errors_of_the_fit_are_those_of_counting(height, n_fits):
     random = np.random.default_rng(5)
@@ -141,6 +141,7 @@ def test_bad_arguments_are_named(call, message):
         call(profile_of(1e4 * expected()))
 
 
+@pytest.mark.slow
 def test_nickel_has_bright_and_dark_lines(run20):
     """The lines of figure 7 of Shaikh et al.: with roll-up three are enhanced, and dark ones run between them."""
     hits = run20.hits(ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))

@@ -48,6 +48,7 @@ def test_a_random_cloud_is_flat():
     away = (result.g[3:] - 1) / result.errors[3:]
     # pairs of shared ions are not independent: up to 1.5 of a Poisson error, of which the largest of 12 is below 3
     assert np.abs(away).max() < 4.5 and np.abs(result.g[3:] - 1).max() < 0.03
+    assert away.std() > 0.7  # not of errors that are too large: of 12 Poisson numbers 1 +- 0.2
 
 
 def test_the_parameters_of_l1_2(cube):

@@ -35,6 +35,7 @@ def test_the_proxigram_of_a_ball_is_its_convolution():
     assert len(copper.ions) == 30 and 12 < chi2 < 57  # 30 degrees of freedom, with probabilities of 0.1 % outside
 
 
+@pytest.mark.slow
 def test_the_proxigram_about_the_isosurface_differs_by_the_shift_of_the_surface():
     cloud = blurred_ball(1, 60_000)
     profile = cloud.proxigram("Cu", 0.425, voxel=0.4, delocalisation=0.4, step=0.1, reach=1.5, largest=True)

@@ -81,6 +81,7 @@ def test_a_fit_and_a_run_know_their_orientation_and_projection(drawn, nickel):
             ae.plot.poles(*wrong)
 
 
+@pytest.mark.slow
 def test_the_poles_of_a_run(drawn, nickel):
     tip = ae.Tip(nickel, apex_radius=3.5, axis=(1, 1, 1), shank_length=3.5, depth=1.2)
     run = ae.Simulation(tip, seed=1).run(800, [ae.Unperturbed()], responses=False, progress=False)

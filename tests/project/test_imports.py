@@ -22,14 +22,14 @@ HELP = "from apt_evap.cli.main import main; assert main({}) == 0"
 def loaded(code):
     """Names of the modules that a new Python has loaded after some code."""
     code = f"import sys, os\nbefore = os.dup(1); os.dup2(2, 1)\n{code}\nsys.stdout.flush(); os.dup2(before, 1)\n"
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code + "print(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])},
-        check=True,
-    )
-    return set(done.stdout.split())
+    return set(printed(code + "print(*sys.modules)").split())
+
+
+def printed(code):
+    """What some code prints in a new Python."""
+    environment = os.environ | {"PYTHONPATH": str(Path(ae.__file__).parents[1])}
+    command = [sys.executable, "-P", "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
 
 
 @pytest.mark.parametrize(
@@ -58,9 +58,10 @@ def test_what_a_map_loads():
         "hits = ae.Hits(x=np.tile(np.linspace(-9, 9, 40), 40), y=np.repeat(np.linspace(-9, 9, 40), 40))",
         "map = hits.map(bins=20, position_step=None, mask=np.ones((20, 20), bool))",
     )
-    assert not loaded("\n".join(lines)).intersection(IMAGES)
-    assert loaded("\n".join((*lines, "ae.similarity(map, map)"))).intersection(IMAGES) == {"skimage.metrics"}
-    assert "skimage.morphology" in loaded("\n".join((*lines, "hits.map(bins=20)")))
+    images = f"print(*({{*sys.modules}} & {set(IMAGES)}))"
+    steps = ("import sys", *lines, images, "ae.similarity(map, map)", images, "hits.map(bins=20)", images)
+    first, second, third = (set(line.split()) for line in printed("\n".join(steps)).splitlines())
+    assert first == set() and second == {"skimage.metrics"} and "skimage.morphology" in third
 
 
 def test_the_test_sees_what_is_loaded():

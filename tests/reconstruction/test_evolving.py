@@ -132,8 +132,9 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     halves = ae.reconstruction.position_covariances(found, exact, local=(0.0, 0.0))
     local = ae.reconstruction.position_covariances(found, exact, local=(0.2, 0.1))
     np.testing.assert_allclose(local - halves, np.broadcast_to(np.diag([0.04, 0.04, 0.01]), halves.shape), atol=1e-12)
-    # an even flux: the halves differ by the noise of 2,000 ions, 0.1 nm
-    assert 0 < np.sqrt(halves[:, 0, 0].mean()) < 0.15
+    # an even flux: the surface is the cap, and the distance from it is the error of the whole, here 0.7 of that told
+    away = (found.specimen_positions - found.cap_positions)[:, 0].std()
+    assert away < np.sqrt(halves[:, 0, 0].mean()) < 2 * away
     depth = ae.reconstruction.position_covariances(found, exact | {"efficiency": 0.1}, local=(0.0, 0.0)) - halves
     # 10 % more efficiency: depths 1/1.1 of theirs, whose standard deviation about their mean is that of an even ramp
     spread = found.depths[-1] / np.sqrt(12)
@@ -166,6 +167,7 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
 
 
+@pytest.mark.slow
 def test_a_phase_at_the_rim_that_is_not_flat_is_left_to_the_cap():
     hits, _ = ions_of(8000, voltage=varying(8000))
     places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions

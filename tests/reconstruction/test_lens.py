@@ -181,6 +181,7 @@ def test_checks_find_wrong_constants(nickel):
     assert planes.good and planes.found == pytest.approx(spacing, rel=0.03)
     assert density.good and density.expected == pytest.approx(1 / volume)
     wrong = ae.reconstruct(hits, **constants, atomic_volume=1.3 * volume, radius=radius)
+    assert not density._replace(found=0.9 * density.expected).good  # too few are as bad as too many
     planes, _ = ae.reconstruction.checks(wrong, poles)
     assert planes.found == pytest.approx(1.3 * spacing, rel=0.03) and not planes.good
     assert "efficiency" in repr(planes)

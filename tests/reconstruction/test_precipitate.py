@@ -115,6 +115,7 @@ def test_what_is_no_precipitate(alloy):
         ae.reconstruction.precipitate_errors(reconstruction_of(sites * [1, 1, 0]), inside, sites)
 
 
+@pytest.mark.slow
 def test_constants_are_fitted_before(alloy):
     """A reconstruction with a wrong scale of the depth is right after the fit of this scale."""
     sites, inside, species = alloy

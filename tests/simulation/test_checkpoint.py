@@ -114,11 +114,11 @@ def work(path):
 
 
 @FORK
-@pytest.mark.parametrize("n_kills", [3, pytest.param(20, marks=pytest.mark.slow)])
-def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, processes, n_kills):
+@pytest.mark.slow
+def test_killed_at_random_moments_and_resumed_it_has_the_same_bits(tmp_path, processes):
     """SIGKILL at random moments; whenever the run comes to its end before, another one begins."""
     simulation().run(N_IONS, [ae.RollUp(ENERGY)], progress=False).save(tmp_path / "uninterrupted.h5")
-    random = np.random.default_rng(3)
+    n_kills, random = 20, np.random.default_rng(3)
     kills, whole, shortest, over = [], 0, None, False
     while len(kills) < n_kills or whole < 3 or over or any("unfinished" in name for name in os.listdir(tmp_path)):
         path = tmp_path / f"{whole}.h5"

@@ -101,6 +101,7 @@ def test_an_instrument_keeps_the_phase_as_truth(mixed):
     assert set(hits.extra["phase"].tolist()) <= {0, 1, 2} and len(hits.extra["phase"]) == len(hits)
 
 
+@pytest.mark.slow
 def test_atoms_with_a_higher_evaporation_field_leave_later():
     """Retention: among atoms of equal height, those of the phase with the high field have the later numbers."""
     hard = ae.specimen.Phase("hard", AL, ae.specimen.HalfSpace((0, 0, 0), (1, 0, 0)), evaporation_field=21.0)

@@ -234,6 +234,7 @@ def test_rounded_coefficients_move_no_hit(tip12, monkeypatch):
         assert np.nanmax(np.abs(one.time_of_flight / two.time_of_flight - 1)) < 6e-6
 
 
+@pytest.mark.slow
 def test_a_file_has_700_bytes_an_ion(tip12, tmp_path):
     run = ae.Simulation(tip12, seed=3).run(800, progress=False)
     sizes = []

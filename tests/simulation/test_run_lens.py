@@ -97,6 +97,7 @@ def test_a_lens_and_a_field_factor_exclude_each_other(run, lens):
 # ---- places and times ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_places_and_times_are_those_of_the_lens(run, real, lens):
     """Free angle -> angle on the cap by the free specimen -> place and time by the lens, ion by ion."""
     flown = real.on_detector(DETECTOR)

@@ -44,12 +44,13 @@ def test_a_specimen_upside_down_or_on_its_side_is_named(needle):
 
 
 def test_a_specimen_that_leans_is_named(needle):
-    for axis in ([0.2, 0.1, 1.0], [1.0, 0.5, -0.2], [-0.6, 0.2, -1.0]):
+    cases = (([0.2, 0.1, 1.0], "leans"), ([1.0, 0.5, -0.2], "lies on its side"), ([-0.6, 0.2, -1.0], "upside down"))
+    for axis, seen in cases:
         axis = np.array(axis) / np.linalg.norm(axis)
         turned = Rotation.align_vectors([axis], [[0.0, 0.0, 1.0]])[0].apply(needle)
         # the flat base is cut along a plane of the lattice: half an atom in 8.5 nm
         assert pointing(turned) == pytest.approx(axis, abs=0.02)
-        with pytest.warns(ae.warnings.SpecimenWarning):
+        with pytest.warns(ae.warnings.SpecimenWarning, match=seen):
             tip_of(turned)
         assert np.ptp(upright(turned)[:, 2]) == pytest.approx(np.ptp(needle[:, 2]), abs=0.15)  # one plane of atoms
 

@@ -147,6 +147,7 @@ def interior(tip):
     return tip.signed_distance(tip.positions) < -1.5 * tip.nearest_neighbour_distance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("prototype", "structure", "fraction", "like", "unlike"),
     [

@@ -101,6 +101,7 @@ def test_atoms_fill_the_shape(structure, base, depth):
         assert not (tip.support & tip.evaporable).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", [(0, 0, 1), (1, 1, 1), (0, 1, 2)])
 @pytest.mark.parametrize("structure", OF_STRUCTURE)
 def test_surface_rule_gives_a_monolayer(structure, axis):
