@@ -14,8 +14,8 @@ def folder(tmp_path, monkeypatch):
     """Copper in a ball among aluminium, as a .pos file with ranges."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(1)
-    positions = 8 * rng.random((20_000, 3))
-    copper = rng.random(20_000) < np.where(np.linalg.norm(positions - 4, axis=1) < 1.2, 0.8, 0.01)
+    positions = 6 * rng.random((8_400, 3))
+    copper = rng.random(8_400) < np.where(np.linalg.norm(positions - 3, axis=1) < 1.2, 0.8, 0.01)
     ae.write("R1.pos", ae.Hits(positions=positions, mass_to_charge=np.where(copper, 63.0, 27.0)))
     ranges = ae.spectra.Ranges(["Al", "Cu"], [26, 62], [28, 64], composition=[{"Al": 1}, {"Cu": 1}])
     ae.io.write_rrng("R1.rrng", ranges)

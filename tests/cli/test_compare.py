@@ -176,6 +176,7 @@ def test_a_registration_from_a_file(folder, capsys):
     )
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_arrays_by_name(folder, capsys):
     with np.load("map.npz") as held:

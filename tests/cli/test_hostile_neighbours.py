@@ -148,6 +148,7 @@ RUNS = {
 }
 """Command lines of all commands but `explore`, `twin` and `paper`, which are below."""
 SLOW = ("index", "start", "compare")
+AGAIN = (("run", "own.toml", "--resume", "--quiet"), ("sweep", "work", "study.toml", "--quiet"), ("map", "run.h5"))
 
 
 def test_every_command_is_here():
@@ -155,7 +156,7 @@ def test_every_command_is_here():
 
 
 LINES = [
-    pytest.param(words, id=" ".join(words[:2]), marks=[pytest.mark.slow] if words[0] in SLOW else [])
+    pytest.param(words, id=" ".join(words[:2]), marks=[pytest.mark.slow] if words[0] in SLOW or words in AGAIN else [])
     for lines in RUNS.values()
     for words in lines
 ]

@@ -169,6 +169,7 @@ def datasets(path):
     return found
 
 
+@pytest.mark.slow
 @NO_PICTURES
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
@@ -365,7 +366,9 @@ def test_a_run_that_misses_the_detector_says_so(folder, capsys):
 
 
 @TERMINAL
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("sent", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     import termios
 
@@ -407,14 +410,14 @@ def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
     """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""
 
     def progress(quiet):
         return lambda ions, n_ions: signal.raise_signal(sent) if 0 < ions < n_ions else None
 
-    ions = 3_000  # several chunks, so that some are left at the interrupt
+    ions = 1_200  # several chunks, so that some are left at the interrupt
     with monkeypatch.context() as patched:
         patched.setattr("apt_evap.cli._progress.run_progress", progress)
         code = main(["run", "small.toml", "--ions", str(ions), "--threads", "1", "--force"])
@@ -740,6 +743,7 @@ def test_version_and_help(capsys):
         assert line in helped
 
 
+@pytest.mark.slow
 def test_a_reader_of_the_output_may_leave(made):
     read, write_end = os.pipe()
     os.close(read)

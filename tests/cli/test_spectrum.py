@@ -53,6 +53,7 @@ def test_peaks_are_named_drawn_and_saved(alloy, tmp_path, capsys):
     assert "--force" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ranges_of_a_file_are_drawn_and_counted(alloy, tmp_path, capsys):
     names = {"Ni": (57.0, 61.5), "Al": (26.5, 27.5)}
     low, high = np.array(list(names.values())).T

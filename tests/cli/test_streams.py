@@ -59,13 +59,18 @@ def test_commands_without_stdout(folder, arguments):
     assert (folder / "ions_map.png").exists() == (arguments[0] == "map")
 
 
+@pytest.mark.slow
 @SHELL
 def test_an_error_does_not_go_to_stdout_for_want_of_stderr(folder):
     assert shell(folder, "2>&-", "info", "none.epos") == (2, "", "")
 
 
 @FULL
-@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("info", "ions.epos")], ids=" ".join)
+@pytest.mark.parametrize(
+    "arguments",
+    [("--version",), *(pytest.param(words, marks=pytest.mark.slow) for words in (("--help",), ("info", "ions.epos")))],
+    ids=" ".join,
+)
 def test_a_full_stdout_is_an_error(folder, arguments):
     sentence = "apt-evap: error: cannot write to the standard output: No space left on device\n"
     assert shell(folder, ">/dev/full", *arguments) == (2, "", sentence)

@@ -6,10 +6,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import apt_evap as ae
 
 
+@pytest.mark.slow
 def test_a_picture_whatever_the_matplotlibrc(tmp_path):
     """LaTeX, which it asks for, need not be installed: it cannot be found here."""
     random = np.random.default_rng(1)

@@ -5,6 +5,7 @@ import re
 import shlex
 import sys
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -42,8 +43,16 @@ def run(small_tip, made_once):
 
 @pytest.fixture(scope="module")
 def run_in(run):
-    lens = ae.detection.LocalElectrode.preset("local electrode")
-    return {"simulated": run, "cap": run.at_evaporation_field(), "lens": run.at_evaporation_field(lens)}
+    """Function of the units: the run in them."""
+
+    @cache
+    def converted(units):
+        if units == "simulated":
+            return run
+        lens = ae.detection.LocalElectrode.preset("local electrode") if units == "lens" else None
+        return run.at_evaporation_field(lens)
+
+    return converted
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +76,10 @@ def equal(first, second):
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")
-@pytest.mark.parametrize("units", ["simulated", "cap", "lens"])
+@pytest.mark.parametrize("units", ["simulated", "cap", pytest.param("lens", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("perturbation", PERTURBATIONS, ids=repr)
 def test_maps_have_the_bits_of_the_library(run_in, measured, perturbation, units):
-    run = run_in[units]
+    run = run_in(units)
     explorer = Explorer(run, measured, TURNED)
     settings = ExplorerSettings(perturbation, 24, 2.0, flattening=8.0)
     for _ in range(2):  # also when everything is kept from the first time

@@ -15,6 +15,8 @@ from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
 from apt_evap.io.measured_file import MeasuredFile
 
+pytestmark = pytest.mark.usefixtures("spectra_once")
+
 
 @pytest.fixture(scope="module")
 def hits():

@@ -503,6 +503,7 @@ def test_a_fit_of_earlier_marks_is_not_shown(measured):
     opened.page.close()
 
 
+@pytest.mark.slow
 def test_a_search_keeps_the_families_of_marked_poles(measured, monkeypatch):
     monkeypatch.setattr("apt_evap.explore.index_panel.start_thread", lambda *arguments: None)
     opened = Opened(Explorer(None, measured))

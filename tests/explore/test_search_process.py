@@ -149,6 +149,7 @@ def test_any_error_of_a_search_is_told(measured, monkeypatch):
     assert "TypeError" in panel.text.text
 
 
+@pytest.mark.slow
 def test_a_registration_whose_process_is_killed_is_over(small_tip, measured):
     later = Later()
     run = ae.Simulation(small_tip, seed=1).run(300, progress=False)
