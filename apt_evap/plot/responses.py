@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
+from apt_evap._common.validation import short_text
 from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default_settings
 from apt_evap.simulation.run import Run
@@ -85,12 +86,12 @@ def response(
         If the run has no responses, or an argument is invalid.
     """
     if mechanism not in MECHANISMS:
-        raise ValueError(f"mechanism must be one of {', '.join(MECHANISMS)}, got {mechanism!r}")
+        raise ValueError(f"mechanism must be one of {', '.join(MECHANISMS)}, got {short_text(mechanism)}")
     energies = np.linspace(0, 1, 51) if energies is None else np.asarray(energies, float)
     unperturbed = lateral_tracks(run, ions, [0.0], [0.0])
     dots = np.column_stack([unperturbed.x[:, 0, 0], unperturbed.y[:, 0, 0]])
     if zoom is not None and not 0 <= zoom < len(dots):
-        raise ValueError(f"zoom must be an index from 0 to {len(dots) - 1}, got {zoom!r}")
+        raise ValueError(f"zoom must be an index from 0 to {len(dots) - 1}, got {short_text(zoom)}")
     colors = ion_colors(len(dots)) if colors is None else list(colors)
     if mechanism == MECHANISMS[0]:
         draw, tracks = _directions, lateral_tracks(run, ions, energies, np.arange(0, 360, 2))

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
+from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, short_text
 from apt_evap.evaporation.emitter import Emitter
 from apt_evap.plot._figure import DrawnAxes, add_colorbar, new_figure, set_title, with_default_settings
 from apt_evap.simulation.simulation import Simulation
@@ -76,7 +76,7 @@ def specimen(
     emitter = _emitter_of(emitter)
     if isinstance(color, str):
         if color not in COLORED_BY:
-            raise ValueError(f"color must be one of {', '.join(COLORED_BY)}, or numbers, got {color!r}")
+            raise ValueError(f"color must be one of {', '.join(COLORED_BY)}, or numbers, got {short_text(color)}")
         values, label = getattr(emitter, color), label or COLORED_BY[color]
     else:
         values = check_array(color, "color", (len(emitter),), finite=False)
@@ -183,7 +183,7 @@ def cut(
     across = check_array(normal, "normal", (3,))
     length = float(np.linalg.norm(across))
     if length == 0:
-        raise ValueError(f"normal must not be zero, got {normal!r}")
+        raise ValueError(f"normal must not be zero, got {short_text(normal)}")
     across = across / length
     diameter = tip.nearest_neighbour_distance
     thickness = 2 * diameter if thickness is None else check_number(thickness, "thickness", above=0, unit="nm")

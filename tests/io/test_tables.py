@@ -155,6 +155,14 @@ def test_nxapm_with_lzf_and_masses_in_a_column(tmp_path):
         read(nxapm(tmp_path / "two.nxs", mass.reshape(150, 2)))
 
 
+@pytest.mark.parametrize("name", ["Blosc", "Zstd"])
+def test_nxapm_compressed_by_a_plugin(tmp_path, name):
+    plugin = pytest.importorskip("hdf5plugin")
+    mass = np.linspace(10, 60, 300, dtype="f4")
+    path = nxapm(tmp_path / "a.nxs", mass, chunks=(75,), **getattr(plugin, name)())
+    np.testing.assert_array_equal(read(path).mass_to_charge, mass)
+
+
 def test_a_tilde_is_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "a.csv").write_text("x [mm],y [mm]\n1,2\n")

@@ -330,7 +330,7 @@ def _line(host, first, line):
     other = plane_normals(host, [plane], "the plane of a line")[0]
     zone = np.cross(first, other)
     if np.linalg.norm(zone) < _SAME:
-        raise ValueError(f"the plane of a line must differ from that of the first pole, got {plane!r}")
+        raise ValueError(f"the plane of a line must differ from that of the first pole, got {short_text(plane)}")
     zone /= np.linalg.norm(zone)
     return zone, np.cross(zone, first), check_array(points, "points of a line", ("m", 2))
 

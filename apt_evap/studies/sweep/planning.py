@@ -101,7 +101,9 @@ class Sweep:
             return key
         if key.isdecimal() and int(key) < len(self.points):
             return self.points[int(key)].key
-        raise ValueError(f"a point must be a key of {_TABLE} or a number below {len(self.points)}, got {key!r}")
+        raise ValueError(
+            f"a point must be a key of {_TABLE} or a number below {len(self.points)}, got {short_text(key)}"
+        )
 
     def state(self, key: str) -> PointState:
         """State of a point, from its files."""

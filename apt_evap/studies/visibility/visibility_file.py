@@ -9,7 +9,7 @@ from typing import Any
 from apt_evap._common.codec import checked, count, from_plain, number, part, settings, to_plain
 from apt_evap._common.files import FileError
 from apt_evap._common.kept import check_made_from
-from apt_evap._common.validation import check_array, check_choice
+from apt_evap._common.validation import check_array, check_choice, short_text
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.config.tables import check_keys, check_table
@@ -39,7 +39,7 @@ def _sizes(value, name):
 
 def _text(value, name):
     if not (isinstance(value, str) and value):
-        raise ValueError(f"{name} must be a text, got {value!r}")
+        raise ValueError(f"{name} must be a text, got {short_text(value)}")
     return value
 
 
