@@ -112,7 +112,7 @@ def by_rangefinder(name, x, y, z, mass):
     return dict(zip(table["element"], table["atomic_percent_weighted"], strict=True))
 
 
-def random(seed=31415, number=25):
+def random(seed=2718, number=25):
     """Specimens of random elements: distances, invented elements, and what was wrong without a word."""
     rng = np.random.default_rng(seed)
     for kind, ions_number, width, tail in KINDS:

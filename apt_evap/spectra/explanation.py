@@ -28,6 +28,7 @@ _ALIKE = 30.0
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60
 _MANY = 0.01  # of all ions: an element with such an ion is there
+_AS_MANY = 0.002  # of all ions: by which other sets of ions may leave more peaks without a name
 _SURE_LINES = 6  # seen peaks of the atomic ions of an element, from which no other set is tried
 _ONE_LINE = 0.03  # of all ions, from which one line may show an element
 _ONE_ISOTOPE = 0.8  # abundance of the isotope of such an element
@@ -228,10 +229,13 @@ class Explainer:
             if name == "H" or len(lines[name]) > 1 or name in self._free:
                 continue
             # hydrogen and the gases have molecules, deuterium has one atomic line
-            if element_of(name) in (*GASES, "D") and len(self._lines_of(choice, chosen, amplitudes, name)) > 1:
+            held = self._lines_of(choice, chosen, amplitudes, name)
+            if name == "D":  # lines that hydrogen may have say nothing
+                tried = choice.candidates(chosen, amplitudes)
+                held -= set(fit.main[tried[choice.atoms[tried, at] == 0]].tolist())
+            if element_of(name) in (*GASES, "D") and len(held) > 1:
                 continue
             place, ions = largest.get(name, (math.nan, 0.0))
-            held = self._lines_of(choice, chosen, amplitudes, name)
             if ions > 0 and len(held) >= _LINES and contents.ions[sorted(held)].sum() > _MOSTLY * contents.ions.sum():
                 continue
             part = ions / max(float(contents.ions.sum()), 1.0)
@@ -356,12 +360,16 @@ class Explainer:
             trial.banned = trial.banned | {name}
             others, other_amplitudes, _ = trial.choose(14, [n for n in start if not trial.atoms[n, at]])
             trial.banned = trial.banned - {name}
-            without, before = trial.value(others), trial.value(start)
+            # each by the calibration that suits it
+            without, before = trial.value(others), min(trial.value(start), choice.value(chosen))
             elements = [set(np.flatnonzero(trial.atoms[numbers].any(0)).tolist()) for numbers in (others, start)]
             new = tuple(trial.elements[number] for number in sorted(elements[0] - elements[1]))
-            unnamed = [sum(trial.fit.ions[number] is None for number in numbers) for numbers in (others, start)]
+            unnamed = [
+                sum(contents.ions[n] for n in numbers if trial.fit.ions[n] is None) for numbers in (others, start)
+            ]
+            names_enough = unnamed[0] <= unnamed[1] + _AS_MANY * contents.total
             ions = [trial.fit.ions[n] for n in others]
-            if without < before and not self._unsure(trial, others, other_amplitudes):
+            if without < before and names_enough and not self._unsure(trial, others, other_amplitudes):
                 if trial is not choice:
                     self._anchors = [point for point in self._anchors if point in self._without(choice, own).points]
                     self._learn(trial, others, other_amplitudes, 3)
@@ -369,7 +377,7 @@ class Explainer:
                     choice = self._choice(contents, _WINDOWS[-1])
                     choice.banned, choice.banned_ions = banned
                 chosen = [n if ion is None else choice.numbers([ion])[0] for n, ion in zip(others, ions, strict=True)]
-            elif without < before + _ALIKE and unnamed[0] <= unnamed[1]:
+            elif without < before + _ALIKE and names_enough:
                 sets.append(([ion for ion in ions if ion is not None], name, without - before))
                 if new:
                     either[name] = new
@@ -398,7 +406,7 @@ class Explainer:
         """Ions with small shifts of their own, contents with the places of these ions only, errors, alternatives."""
         ions = [choice.fit.ions[number] for number in chosen if choice.fit.ions[number] is not None]
         contents = choice.fit.contents
-        banned, banned_ions = choice.banned, choice.banned_ions
+        banned, banned_ions = choice.banned - {"D"}, choice.banned_ions  # to be named beside hydrogen
         choice = self._choice(contents, _WINDOWS[-1], own_shift=_OWN_SHIFT)
         choice.banned, choice.banned_ions = banned, banned_ions
         chosen = self._with_shifted(choice, choice.numbers(ions).tolist())
