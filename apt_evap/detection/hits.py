@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -97,6 +98,8 @@ class Hits:
         Units of the further columns by name.
     source : str
         File name, or origin of the ions.
+    ranges : Ranges, optional
+        Ranges of mass that belong to the ions, for `composition`. Selections keep them.
     extent : tuple of float, optional
         Area of the detector of a run: x_min, x_max, y_min, y_max [mm]. None for measured ions, for a selection of the
         ions, and for ions with changed coordinates (use ``extent=None`` with the new x and y in `dataclasses.replace`).
@@ -131,6 +134,7 @@ class Hits:
     extra: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
     source: str = ""
+    ranges: Any = None
     extent: tuple[float, float, float, float] | None = None
 
     def __post_init__(self):
@@ -293,6 +297,37 @@ class Hits:
         time_zero = check_number(time_zero, "time_zero", unit="ns")
         return replace(self, mass_to_charge=mass_to_charge(self.total_voltage, time - time_zero, x, y, distance))
 
+    def composition(self, elements: str | Sequence[str] | None = None) -> Any:
+        """Composition in at.%, with errors and what is unexplained; that of `apt_evap.spectrum`.
+
+        Parameters
+        ----------
+        elements : str or sequence of str, optional
+            Elements and ions that are expected. By default the ions of the ranges, if the ions have any, and else all
+            elements are tried.
+
+        Returns
+        -------
+        Composition
+
+        Raises
+        ------
+        ValueError
+            If there is no mass_to_charge, or an element is unknown.
+
+        Examples
+        --------
+        >>> rng = np.random.default_rng(1)
+        >>> mass = rng.choice([62.93, 64.93], 5000, p=[0.69, 0.31]) * rng.normal(1, 5e-4, 5000)
+        >>> ae.Hits(mass_to_charge=mass).composition("Cu").at_percent
+        {'Cu': 100.0}
+        """
+        self.require("mass_to_charge")
+        # spectra are on a layer above the ions: their module is loaded by its name when it is needed
+        spectrum = import_module("apt_evap.spectra.mass_spectrum").spectrum
+        ranges = self.ranges if elements is None else None
+        return spectrum(self, elements, ranges).composition
+
     def correlation(self) -> Correlation:
         """Pairs of detected ions of one pulse, and the numbers of pulses with one, two and more ions.
 
@@ -449,7 +484,7 @@ class Hits:
             selection = np.atleast_1d(index)
         columns = {name: getattr(self, name)[selection] for name in self.columns}
         extra = {name: values[selection] for name, values in self.extra.items()}
-        selected = Hits(**columns, extra=extra, units=self.units, source=self.source)
+        selected = Hits(**columns, extra=extra, units=self.units, source=self.source, ranges=self.ranges)
         if self._may_have_strays and (known := known_strays(self.x, self.y))[0]:
             # a part of the ions has the field of view of all
             keep_strays(selected.x, selected.y, None if known[1] is None else known[1][selection])

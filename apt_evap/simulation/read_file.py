@@ -1,17 +1,27 @@
 """Reading of a file of any kind: a run, ions or a map."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
+from apt_evap.detection.hits import Hits
 from apt_evap.io import formats
 from apt_evap.simulation.run import load
 from apt_evap.simulation.run_hdf5 import is_run
+from apt_evap.spectra.mass_ranges import Ranges
 
 
-def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
+def read(
+    path: AnyPath,
+    *,
+    format: str | None = None,
+    columns: Sequence[str] | None = None,
+    ranges: AnyPath | Ranges | None = None,
+    **options: Any,
+) -> Any:
     """Read a file of ions, a run or a map. The format is recognised by the first bytes if possible, or by the suffix.
 
     Parameters
@@ -22,6 +32,8 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
         Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional
         Names of the columns to read; only these are kept in memory. All by default. Not for a run, an .npz and TAPSim.
+    ranges : str, path-like or Ranges, optional
+        Ranges of mass of the ions, or a file of these, for `Hits.composition`.
     **options
         Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
         sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte
@@ -51,10 +63,17 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     array([29., 29., 58.], dtype=float32)
     """
     if formats.format_of(path, format).suffix != ".h5" or not is_run(path):
-        return formats.read(path, format=format, columns=columns, **options)
+        content = formats.read(path, format=format, columns=columns, **options)
+        if ranges is None:
+            return content
+        if not isinstance(content, Hits):
+            raise FileError(f"{str(path)!r}: ranges are for ions with m/n, got {content!r}")
+        return replace(content, ranges=ranges if isinstance(ranges, Ranges) else formats.read_ranges(ranges))
     name = str(check_path(path))
     for option in options:
         raise FileError(f"{name!r}: reading .h5 files takes no options, got {option!r}")
+    if ranges is not None:
+        raise FileError(f"{name!r}: the ions of a run have elements, so that reading it takes no ranges")
     if columns is not None:
         raise FileError(f"{name!r}: reading a run takes no columns, got {short_text(columns)}")
     return load(path)

@@ -11,14 +11,6 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence
 from apt_evap.specimen.nuclides import ISOTOPES
 
-# fmt: off
-SPECTRUM_ELEMENTS = (
-    "H", "B", "C", "N", "O", "V", "Mn", "Zr", "Nb", "Re", "Mg", "Al", "Si", "Ti", "Cr", "Fe", "Co", "Ni", "Cu", "Mo",
-    "Rh", "Ag", "Ta", "W", "Ir", "Pt", "Au",
-)
-# fmt: on
-"""Elements with which the fit of a flight length may start."""
-
 # relative: atomic weights rounded to three digits still count as natural, the isotopes of Ni, Cu, Fe and Si do not
 _SAME_MASS = 1e-3
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from apt_evap.detection.hits import Hits
-from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, mean_mass
 from apt_evap.spectra.flight_fit import FlightFit
+from apt_evap.spectra.ion_names import COMMON, GASES, HIGHEST_CHARGE, NOBLE
 from apt_evap.spectra.isotope_comb import LARGEST_MISFIT, Comb, LogSpectrum
 
 _MOLECULES = ("H2", "OH", "H2O", "N2", "O2", "CO")  # of the residual gas
-_HIGHEST_CHARGES = ((85.0, 2), (170.0, 3), (math.inf, 4))  # mass [Da] below which ions have at most this charge
+_RARE = 0.7  # weight of the ions that a rare element explains
+_ELEMENTS = tuple(name for name in HIGHEST_CHARGE if name not in (*NOBLE, "D"))
 _EXPECTED = 3  # charge that every expected ion may have
 # of the factor on m/n: of a nominal length, with the first ion of a fit, with a fit
 _FLIGHT, _BEGUN, _FITTED = 0.1, 0.02, 0.006
@@ -116,14 +117,15 @@ def _candidates(counts, formulas, tolerance):
     bounds = 1.0 - tolerance, 1.0 + tolerance
     combs = [
         comb
-        for formula in dict.fromkeys([*SPECTRUM_ELEMENTS, *_MOLECULES, *(formulas or ())])
+        for formula in dict.fromkeys([*_ELEMENTS, *_MOLECULES, *(formulas or ())])
         for charge in _charges(formula, formula in (formulas or ()))
         if (comb := counts.comb(formula, charge, *bounds)) is not None
         and comb.fill >= 1 - LARGEST_MISFIT
         and comb.intervals
     ]
-    scores = {comb: comb.ions * comb.fill for comb in combs}
-    for comb in sorted(combs, key=lambda comb: -comb.ions):
+    usual = {*COMMON, *GASES, *_MOLECULES, *(formulas or ())}
+    scores = {comb: comb.ions * comb.fill * (1.0 if comb.formula in usual else _RARE) for comb in combs}
+    for comb in sorted(combs, key=lambda comb: -scores[comb]):
         if formulas is not None and comb.formula not in formulas:
             continue
         rivals = [other for other in combs if other is not comb and _shared(comb, other) > 0.5]
@@ -133,10 +135,7 @@ def _candidates(counts, formulas, tolerance):
 
 def _charges(formula, expected):
     """Charge states of an ion that are tried."""
-    highest = _EXPECTED if expected else 1
-    if formula in ISOTOPES:
-        highest = max(highest, next(charge for mass, charge in _HIGHEST_CHARGES if mean_mass(formula) < mass))
-    return range(1, highest + 1)
+    return range(1, max(_EXPECTED if expected else 1, HIGHEST_CHARGE.get(formula, 1)) + 1)
 
 
 def _shared(comb, other):

@@ -4,8 +4,9 @@ from scipy import stats
 
 from apt_evap._common.ion_random import IonRandom
 from apt_evap.emission.post_ionisation import FLIGHT_CHARGES, RATIO_PARAMETERS
-from apt_evap.specimen.isotopes import ISOTOPES, SPECTRUM_ELEMENTS, draw_isotopes, mean_mass
+from apt_evap.specimen.isotopes import ISOTOPES, draw_isotopes, mean_mass
 from apt_evap.specimen.materials import MATERIALS
+from apt_evap.spectra.ion_names import HIGHEST_CHARGE
 
 # standard atomic weights and their uncertainties (Prohaska et al., Pure Appl. Chem. 94, 573, 2022; abridged: Mg, Si,
 # H, B, C, N, O)
@@ -41,8 +42,8 @@ ATOMIC_WEIGHTS = {
 
 
 def test_every_element_with_numbers_has_isotopes():
-    assert set(SPECTRUM_ELEMENTS) >= set(FLIGHT_CHARGES)
-    assert set(ISOTOPES) >= set(SPECTRUM_ELEMENTS) | set(MATERIALS) | set(RATIO_PARAMETERS) | set(ATOMIC_WEIGHTS)
+    assert set(HIGHEST_CHARGE) >= set(FLIGHT_CHARGES)
+    assert set(ISOTOPES) >= set(HIGHEST_CHARGE) - {"D"} | set(MATERIALS) | set(RATIO_PARAMETERS) | set(ATOMIC_WEIGHTS)
 
 
 # the commission states ranges: specimens of these elements differ by up to 1.5e-4

@@ -105,6 +105,48 @@ def test_errors_follow_from_counting():
     assert Amounts([{"A": 1}], np.array([1.0]), np.eye(1)).composition(0.101).refused
 
 
+def test_other_names_are_in_the_error_by_their_likelihood():
+    """The same ions under another name, as likely: half of the probability is at 100 at.%, half at 0."""
+    amounts = Amounts([{"A": 1}, {"B": 1}], np.array([50.0, 50.0]), np.zeros((2, 2)), [([{"C": 1}], np.ones(1), 0.0)])
+    composition = amounts.composition(0.0)
+    assert composition.error == pytest.approx({"A": 50 / np.sqrt(2), "B": 50 / np.sqrt(2)})
+    assert composition.span == {"A": (0, 50), "B": (0, 50), "C": (0, 100)} and "perhaps C: 0 to 100" in str(composition)
+    unlikely = Amounts(amounts.atoms, amounts.ions, amounts.covariance, [([{"C": 1}], np.ones(1), 10.0)])
+    assert unlikely.composition(0.0).error["A"] == pytest.approx(50 / np.sqrt(np.exp(5) + 1))
+
+
+def test_one_line_of_three_charges_is_enough_where_no_other_ion_has_its_place():
+    """Tantalum has one isotope; sodium shares its place with no molecule. An yttrium hydride may be zirconium."""
+    nickel = {("Ni", 2): 60, ("Ni", 1): 8, ("Mo", 2): 4, ("Mo", 3): 4, ("Cr", 2): 10}
+    result = ae.spectrum(made(nickel | {("Ta", 3): 1}, 200_000))
+    assert result.composition["Ta"] == pytest.approx(100 / 87, rel=0.1) and not result.unexplained
+    salt = {("Ca", 2): 50, ("CaO", 1): 10, ("O", 1): 10, ("CO", 1): 10, ("C", 1): 3}
+    assert "Na" in ae.spectrum(made(salt | {("Na", 1): 1})).composition.at_percent
+    lone = ae.spectrum(made({("Zn", 2): 80, ("Zn", 1): 2, ("Ca", 2): 6, ("Ca", 1): 2, ("Y", 1): 1}))
+    assert "Y" not in lone.composition.at_percent and lone.unexplained_part > 0.005
+
+
+def test_isotopes_that_are_one_broad_peak_are_taken_apart():
+    """Peaks three times as wide, with tails longer than the distance of the isotopes of Gd2+: measured 0.1 at.%."""
+    ions = {("Gd", 2): 40, ("Gd", 1): 0.8, ("Ga", 1): 10, ("Ga", 2): 0.2, ("Mo", 1): 1, ("H", 1): 2}
+    result = ae.spectrum(made(ions, 300_000, width=1.2e-3, tail=4e-3))
+    assert distance(result.composition, truth(ions)) < 0.6
+
+
+def test_ions_have_the_composition_of_their_spectrum(tmp_path):
+    hits = made({("Ni", 2): 9, ("Al", 1): 1}, 20_000)
+    assert hits.composition().at_percent == ae.spectrum(hits).composition.at_percent
+    ranges = ae.spectrum(hits).ranges()
+    ae.io.write_rrng(tmp_path / "a.rrng", ranges)
+    ae.write(tmp_path / "a.pos", ae.Hits(mass_to_charge=hits.mass_to_charge, positions=np.zeros((len(hits), 3))))
+    read = ae.read(tmp_path / "a.pos", ranges=tmp_path / "a.rrng")
+    expected = ae.spectrum(read, ranges=read.ranges).composition
+    assert read.composition().at_percent == expected.at_percent and read[:500].ranges is read.ranges
+    assert read.composition(["Ni", "Al"]).at_percent == ae.spectrum(read, ["Ni", "Al"]).composition.at_percent
+    with pytest.raises(ValueError, match="mass_to_charge"):
+        ae.Hits(x=[0.0]).composition()
+
+
 def test_ranges_count_only_their_ions_and_name_those_they_do_not_explain():
     hits = made({("Ni", 1): 70, ("Si", 2): 20, ("Al", 1): 10})
     low, high = np.array([[13.9, 14.15], [26.9, 27.2], [57.8, 58.3], [59.8, 60.3], [60.8, 61.3]]).T
