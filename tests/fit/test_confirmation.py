@@ -39,6 +39,7 @@ def structure(map):
     return Structure(tuple(rings), pole_profile(map, PROJECTION, POLE), whole)
 
 
+@pytest.mark.slow
 def test_lines_of_the_other_sign_are_not_alike():
     """The symmetry alone calls bright and dark lines alike."""
     bright, same, dark = lines(1.0, seed=1), lines(0.8, seed=2), lines(-1.0, seed=3)
@@ -58,6 +59,8 @@ def test_alike_needs_folded_maps_that_correlate():
     unrelated = structure(ae.DetectorMap.from_array(noise, EDGES, EDGES, mask=X**2 + Y**2 < 39**2, is_counts=True))
     assert confirmed(ALIKE, second._replace(folded=unrelated.folded), first).verdict == "doubtful"
     assert confirmed(ALIKE, second._replace(folded=None), first).verdict == "doubtful"
+    faint = second._replace(folded=structure(lines(0.1, seed=2)).folded)
+    assert 0.1 < faint.correlation(first) < LEAST_CORRELATION and confirmed(ALIKE, faint, first).verdict == "doubtful"
     assert confirmed(ALIKE, None, None).verdict == "doubtful"
     for verdict in ("doubtful", "not alike"):  # it never makes maps alike
         by_symmetry = ALIKE._replace(verdict=verdict)

@@ -303,6 +303,7 @@ def test_rings_of_a_study(twin):
     assert saved["plane"] == [1, 1, 1] and len(saved["measured"]["rings"]) == len(scores.measured.rings)
 
 
+@pytest.mark.slow
 def test_blur_is_warned_of(run, other):
     """A grid of broad lateral energies only, for a map with lines: the best map has lost them."""
     sharp = measured_map(other, ROLLUP)
@@ -408,6 +409,7 @@ def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
     assert np.mean(errors) / np.std(values, ddof=1) == pytest.approx(1.13, abs=0.18)
 
 
+@pytest.mark.slow
 def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
     """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
     measured = seen(other, ROLLUP)
@@ -535,6 +537,7 @@ def test_hidden_energies_are_found(twin):
     assert high - low < 0.3
 
 
+@pytest.mark.slow
 def test_a_registration_is_refined(run, other):
     """From 1.5 degrees, 3 % and 1 mm off, back to the frame in which the map was made."""
     search = EnergySearch(
@@ -658,6 +661,7 @@ def test_energies_are_reported_in_real_units_first(twin, run):
     assert real_units_of(replace(run, cap=CapHistory.empty())) is None
 
 
+@pytest.mark.slow
 def test_a_study_of_a_run_in_real_units_finds_real_energies(run):
     """The same measured map: the energies of the grid are multiplied by the factor."""
     real = run.at_evaporation_field(smoothing=100_000)
@@ -741,6 +745,7 @@ def test_densities_have_no_noise_of_their_own(run, other):
     assert (b.errors < a.errors).all() and (b.errors > 0).all()
 
 
+@pytest.mark.slow
 def test_the_axis_of_the_rollup_fraction(run, other):
     measured = seen(other, ae.Combined(ae.TruncatedNormal(0.2, 0.1), 0.9))
     study = fit_energies(

@@ -290,7 +290,14 @@ def test_unwritable_places(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
-@pytest.mark.parametrize("suffix", [entry.suffix for entry in FORMATS if entry.write and entry.read])
+@pytest.mark.parametrize(
+    "suffix",
+    [
+        pytest.param(entry.suffix, marks=[pytest.mark.slow] if entry.suffix == ".tapsim" else [])  # a text
+        for entry in FORMATS
+        if entry.write and entry.read
+    ],
+)
 def test_every_format_that_writes_reads_back_more_ions_than_a_chunk(tmp_path, suffix):
     values = np.random.default_rng(2).uniform(1, 50, (40_000, 7)).astype("f4")
     options = {"elements": ["Si"]} if suffix == ".nxs" else {}

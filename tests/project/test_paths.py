@@ -6,7 +6,7 @@ import importlib.util
 import inspect
 import re
 import sys
-import tokenize
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -70,14 +70,19 @@ def test_what_a_text_names_exists(path):
                     assert exists(f"{node.module}.{item.name}".removeprefix("apt_evap.")), (node.module, item.name)
 
 
+NAMES = ("id", "attr", "name", "arg", "asname", "module")  # of the nodes of a syntax tree
+tree_of = cache(lambda path: ast.parse(path.read_text()))
+
+
 def identifiers():
     """Names of the code of the package, its modules and folders; words of its texts and comments do not count."""
     words = set(sys.stdlib_module_names) | {"apt_evap", "scipy"}
     for path in PACKAGE.rglob("*"):
         words.add(path.stem)
         if path.suffix in (".py", ".pyi"):
-            with path.open("rb") as file:
-                words |= {token.string for token in tokenize.tokenize(file.readline) if token.type == tokenize.NAME}
+            for node in ast.walk(tree_of(path)):
+                for value in (getattr(node, name, None) for name in NAMES):
+                    words |= set(value.split(".")) if isinstance(value, str) else set()
         elif path.suffix in (".pyx", ".pxd"):
             words |= set(re.findall(r"\w+", path.read_text()))
     return words
@@ -87,7 +92,7 @@ def test_names_in_backticks_exist():
     """A name of the package in a page or a docstring occurs in its code, so none is left of an earlier version."""
     texts = {path: [path.read_text()] for path in TEXTS if path.suffix == ".rst"}
     for path in PACKAGE.rglob("*.py"):
-        nodes = ast.walk(ast.parse(path.read_text()))
+        nodes = ast.walk(tree_of(path))
         texts[path] = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     words = identifiers()
     assert len(words) > 3_000

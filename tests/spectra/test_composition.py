@@ -23,7 +23,7 @@ ALLOYS = {
 
 
 @pytest.mark.parametrize("name", ALLOYS)
-@pytest.mark.parametrize("blind", [True, False])
+@pytest.mark.parametrize("blind", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_ions_and_at_percent_of_an_alloy(name, blind):
     """Measured: the sum of differences is 0.1 to 0.3 at.% for 60,000 ions, where counting alone gives 0.2."""
     ions, expected = ALLOYS[name], truth(ALLOYS[name])
@@ -35,6 +35,7 @@ def test_ions_and_at_percent_of_an_alloy(name, blind):
         assert abs(result.composition[element] - value) < 4 * result.composition.error[element] + 0.05
 
 
+@pytest.mark.slow
 def test_an_ion_below_the_peak_of_another_is_found_by_its_other_lines():
     """48Ti3+ is one peak with O+, and Ti2+ is too weak: measured difference 0.33 at.%."""
     ions = {("Mg", 2): 10, ("Mg", 1): 4, ("Mn", 2): 40, ("Mn", 1): 4, ("Sn", 1): 10, ("Sn", 2): 1, ("Ti", 3): 1}
@@ -54,6 +55,7 @@ def test_charges_of_the_made_ions_are_counted():
     assert {"C₂⁺", "C²⁺", "C₃²⁺"} <= {ion.name for ion in result.ions}
 
 
+@pytest.mark.slow
 def test_an_unexplained_spectrum_has_no_composition():
     """Silicon of two equal isotopes is no element of the table, until its abundances are given."""
     enriched = {"Si": {28: 0.5, 30: 0.5}}

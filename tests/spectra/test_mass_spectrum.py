@@ -104,7 +104,7 @@ def test_ions_and_background_of_peaks_are_counted():
     assert np.mean(labels == "Fe") == pytest.approx(8 / 9.5, rel=0.03)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize("element", [None, "W", "Cu"])
 def test_noise_has_no_ions(element, seed):
     hits = recorded(NICKEL, 90.0, 0.0, n=0, background=30_000, seed=seed)
@@ -116,7 +116,10 @@ def test_noise_has_no_ions(element, seed):
         result.select("W")
 
 
-@pytest.mark.parametrize("element", ["Cu", "Co", "Fe", "Pt", "Al", "Rh", "Ta", "Re"])
+@pytest.mark.parametrize(
+    "element",
+    ["Cu", "Pt", *(pytest.param(name, marks=pytest.mark.slow) for name in ("Co", "Fe", "Al", "Rh", "Ta", "Re"))],
+)
 def test_a_wrong_element_is_refused_in_a_sentence(element):
     hits = recorded({("W", 3): 1}, 310.0, 0.0, (9000, 9100))
     result = ae.spectrum(hits, element, distance=305.0)
@@ -219,6 +222,7 @@ def test_saved_ranges_are_read_again(tmp_path):
     assert not (tmp_path / "b.rrng").exists()
 
 
+@pytest.mark.slow
 def test_a_named_spectrum_is_drawn():
     result = ae.spectrum(recorded(NICKEL, 90.0, 10.0), "Ni", distance=90.0)
     ax = ae.plot.spectrum(result)
@@ -227,6 +231,7 @@ def test_a_named_spectrum_is_drawn():
     plt.close(ax.figure)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "W_tap.raw").exists(), reason="needs the measured tungsten, which is not distributed")
 @pytest.mark.filterwarnings("ignore:.*1 of 100,000 ions lies far outside:apt_evap.warnings.DataWarning")
 def test_measured_tungsten():

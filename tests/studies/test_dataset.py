@@ -613,6 +613,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path, names):
         make_dataset(plan, tmp_path)
 
 
+@pytest.mark.slow
 def test_files_beside_those_of_a_set_are_left_alone(tmp_path):
     make_dataset(planned(tmp_path), tmp_path / "set")
     for name in ("notes.txt", "train-0777.h5"):

@@ -86,6 +86,7 @@ def test_a_run_that_another_program_writes_is_no_failure(sweep):
     check_bits(sweep, [folder.name])
 
 
+@pytest.mark.slow
 def test_a_failed_point_waits_for_retry(sweep, tmp_path, capsys):
     bad, good = sweep.keys
     poison(sweep, bad)
@@ -106,6 +107,7 @@ def test_an_error_that_is_not_expected_fails_the_point_too(sweep, monkeypatch):
     assert state.name == "failed" and state.message == "KeyError: 'tip'"
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_no_failure(sweep):
     """Files larger than a limit are errors of the system, as on a full disk."""
     folder = sweep.folder_of(sweep.keys[0])

@@ -287,6 +287,7 @@ def test_operators_are_not_extrapolated(operators, values):
         operators.emulate(1, **values)
 
 
+@pytest.mark.slow
 def test_displaced_sites_have_the_moments_of_the_operators(operators):
     matrix = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.02], [0.0, 0.02, 0.01]])
     same = replace(

@@ -94,6 +94,7 @@ def test_the_run_of_another_point_is_not_collected(sweep):
     check_done(sweep)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["run.h5", "run.h5.unfinished"])
 def test_the_unfinished_run_of_another_point_is_not_continued(fresh, part):
     """It names no settings of a point yet: its own settings are compared."""
@@ -251,6 +252,7 @@ def test_a_folder_that_is_a_link_is_refused(sweep, tmp_path, name):
     assert sweep_status(sweep)["counts"]["wrong"] == collect_sweep(sweep)["points"] - collect_sweep(sweep)["done"] > 0
 
 
+@pytest.mark.slow
 def test_files_of_a_sweep_that_are_links_are_not_replaced(sweep, tmp_path):
     (tmp_path / "base.toml").write_text(SMALL)
     (tmp_path / "study.toml").write_text(FOUR)

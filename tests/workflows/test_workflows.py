@@ -67,6 +67,7 @@ def test_a_simulated_file_is_extended_and_nobody_elses_is_replaced(folder):
     assert len(ae.simulate("small.toml", overwrite=True, ions=5, progress=False).run) == 5
 
 
+@pytest.mark.slow
 def test_a_finished_run_without_its_picture_gets_it(folder):
     """The same command gives the same files, wherever it was killed."""
     first = ae.simulate("small.toml", ions=20, progress=False)
