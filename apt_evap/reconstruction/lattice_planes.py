@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number
+from apt_evap._common.validation import check_array, check_number, check_seed
 from apt_evap.reconstruction.calibration import (
     DistributionMap,
     distribution_map,
@@ -137,7 +137,7 @@ def find_planes(
     chosen = points[np.hypot(*(points[:, :2] - centre).T) <= radius]
     if len(chosen) < _FEWEST:
         raise ValueError(f"the cylinder must hold at least {_FEWEST} ions, got {len(chosen)}")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(check_seed(seed))
     normal, amplitude = _sharpest(chosen, widest, reach, rng)
     by_chance = np.empty(_SCATTERED)
     for number in range(_SCATTERED):
