@@ -287,10 +287,15 @@ def refine_contrast(
     """
     places, areas = places_of()
     limits = np.log(bounds)
+    local: dict[tuple[float, float], Floats] = {}
 
     def sample(images, geometry):
         turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
-        directions = directions_of(places, radius, math.exp(geometry[3]), geometry[4]) @ turn
+        key = float(geometry[3]), float(geometry[4])
+        if key not in local:  # rotations do not change them
+            local.clear()
+            local[key] = directions_of(places, radius, math.exp(geometry[3]), geometry[4])
+        directions = local[key] @ turn
         pictures = sampled(images, terms.equal(directions), terms.corner)
         return pictures - (pictures @ areas)[:, None]
 

@@ -1,8 +1,13 @@
-"""Checks that the best orientation of a map can fail: a second lattice in a half of it, and surrogates of the map.
+"""Checks that the best orientation of a map can fail: a second lattice in a part of it, and surrogates of the map.
 
 **Halves.** In each of eight half discs the evidence of the local contrast is computed for all orientations at the scale
 of the winner. Where another orientation has more evidence than the winner, and than no crystal (0), the map may hold a
 second lattice. A half without evidence is no second lattice, unless the whole map is clear.
+
+**Segments.** A small grain at the rim has too few independent pieces for amplitudes of its own. So the amplitudes of
+the winner are kept: its picture says what any orientation of the same crystal would show in a segment of the disc. The
+logarithm of the likelihood ratio of the best other orientation and of the winner, both with these amplitudes, is the
+evidence of a second grain. In a grain of the winner its own lines are there, and the ratio is negative.
 
 **Surrogates.** A surrogate of a map has the same harmonics of every ring, but each harmonic with a random phase, the
 same for all rings and for counts and contrast. Rings, radial changes and the width of lines stay; what belongs to one
@@ -18,8 +23,9 @@ import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.indexing.contrast_search import PIECES, Terms, places_of, refine_contrast
+from apt_evap.maps.indexing.contrast_search import PIECES, Terms, exact_evidence, places_of, refine_contrast
 from apt_evap.maps.indexing.joint_search import JOINT, JointSearch
+from apt_evap.maps.indexing.master_pattern import sampled
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Start, about_axis, axes_of, polar_grid
 from apt_evap.maps.indexing.refine import Refined, directions_of, refine
 from apt_evap.maps.indexing.two_criteria import View
@@ -34,6 +40,11 @@ FEW, MANY, SURE = 8, 20, 7.0
 """Surrogates at first, and of a map that is not SURE standard deviations above the first ones."""
 _NEAR = (-2.4, 0.0, 2.4)  # degrees about three axes by which the winner is freed in a half
 _SCALES, _STRETCHES = (0.93, 1.0, 1.07), (1.0, 0.5)  # factors of its scale and stretch
+CHORDS, SEGMENTS = (0.0, 0.3, 0.5), 16
+"""Distances of the chords beyond which segments of the disc are searched [radii], with 50, 31 and 20 % of its area, and
+azimuths of each. Beyond a chord at 0.65 radii measured nickel has 24, by the lens at its rim."""
+_SEGMENT_STEP = 3.0  # degrees: distance of neighbouring axes in the search of the segments
+_FREED, _SEGMENT_SCALES = (-2.0, 0.0, 2.0), (0.95, 1.0, 1.05)  # degrees and factors by which the winner is freed there
 _AT_ONCE = 40  # axes
 _STEPS = 7  # of the refinement of a surrogate
 _POLAR_RINGS, _POLAR_AZIMUTHS = 48, 192  # of the counts: about the bins of the refinement
@@ -158,6 +169,97 @@ def _sums_of_halves(values):
     twice = np.concatenate([values, values[:, : AZIMUTHS // 2]], axis=1, dtype=np.float64).cumsum(axis=1)
     twice = np.concatenate([np.zeros_like(twice[:, :1]), twice], axis=1)
     return twice[:, AZIMUTHS // 2 : AZIMUTHS // 2 + AZIMUTHS] - twice[:, :AZIMUTHS]
+
+
+class SecondGrain(NamedTuple):
+    """The segment of the disc in which another orientation is most likely."""
+
+    evidence: float
+    """Twice the logarithm of the likelihood ratio of the best other orientation and the winner."""
+    chord: float
+    """Distance of the chord of the segment from the centre [radii]."""
+    azimuth: float
+    """Of the middle of the segment [degrees]."""
+
+
+def second_grain(view: View, terms: Terms, fit: Refined) -> SecondGrain:
+    """Likelihood of another orientation in a segment of the disc, with the amplitudes of the winner.
+
+    Parameters
+    ----------
+    view : View
+        The map.
+    terms : Terms
+        Those of the local contrast of the crystal.
+    fit : Refined
+        The winner.
+    """
+    places, areas = places_of()
+    radius, picture = view.disc.radius, view.picture
+    # what the winner shows in any direction of the crystal, and the variance that it leaves
+    local = directions_of(places, radius, fit.scale, fit.stretch)
+    images = terms.images(radius / fit.scale)
+    shown = sampled(images, terms.equal(local @ fit.matrix), terms.corner)
+    shown = shown - (shown @ areas)[:, None]
+    norms = np.maximum(np.sqrt(shown**2 @ areas), 1e-3)
+    shown /= norms[:, None]
+    _, amplitudes = exact_evidence((shown * areas) @ shown.T, (shown * areas) @ picture, terms.priors, terms.signed)
+    left = 1 - areas @ (picture**2 - (picture - amplitudes @ shown) ** 2)
+    weight = PIECES / max(float(left), 1e-3)
+    image = np.tensordot((amplitudes / norms).astype(np.float32), images, 1)[None]
+
+    def seen(matrices, directions):
+        """Pictures of orientations, shape (n, points)."""
+        pictures = sampled(image, terms.equal((directions @ matrices).reshape(-1, 3)), terms.corner)
+        return pictures.reshape(len(matrices), -1)
+
+    azimuths = np.arange(SEGMENTS) * (2 * math.pi / SEGMENTS)
+    toward = places @ np.array([np.cos(azimuths), np.sin(azimuths)])
+    segments = np.array([np.where(along > chord, areas, 0.0) for chord in CHORDS for along in toward.T])
+    shares = segments.sum(axis=1)
+    means = segments @ picture / shares
+
+    winner = np.full(len(segments), -np.inf)
+    turns = [(x, y, z) for x in _FREED for y in _FREED for z in _FREED]
+    near = scipy.spatial.transform.Rotation.from_rotvec(turns, degrees=True).as_matrix() @ fit.matrix
+    for factor in _SEGMENT_SCALES:
+        pictures = seen(near, directions_of(places, radius, factor * fit.scale, fit.stretch))
+        inside = pictures @ segments.T / shares
+        gains = 2 * (pictures @ (segments * picture).T - inside * means * shares)
+        gains -= pictures**2 @ segments.T - inside**2 * shares
+        winner = np.maximum(winner, weight * gains.max(axis=0))
+
+    group = point_group(terms.structure)
+    proper = group[np.linalg.det(group) > 0]
+    angles = polar_grid(RINGS, AZIMUTHS)[1]
+    about = np.stack([scipy.spatial.transform.Rotation.from_rotvec((0, 0, angle)).as_matrix() for angle in angles])
+    turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, _SEGMENT_STEP)])
+    turns = np.concatenate([turns, np.diag([1.0, -1.0, 1.0]) @ -turns])  # both hands
+
+    def spectra(values):
+        return scipy.fft.rfft(values.astype(np.float32).reshape(len(values), RINGS, AZIMUTHS), axis=2)
+
+    of_picture, of_segments = spectra(segments * picture), spectra(segments)
+    other = np.full(len(segments), -np.inf)
+    for first in range(0, len(turns), _AT_ONCE):
+        some = turns[first : first + _AT_ONCE]
+        pictures = seen(some, local)
+        pictures = pictures - (pictures @ areas)[:, None]
+        plain, squares = spectra(pictures).conj(), spectra(pictures**2).conj()
+        matrices = about @ some[:, None]
+        traces = np.einsum("naij,gjk,ik->nag", matrices, proper, fit.matrix, optimize=True).max(axis=2)
+        far = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))) > FAR
+        for k, share in enumerate(shares):
+            # sums over the segment for every azimuth of the pattern
+            cross, inside, power = (
+                scipy.fft.irfft((spectrum * part).sum(axis=1), AZIMUTHS, axis=1)
+                for spectrum, part in ((plain, of_picture[k]), (plain, of_segments[k]), (squares, of_segments[k]))
+            )
+            gains = 2 * (cross - inside * means[k]) - (power - inside**2 / share)
+            other[k] = max(other[k], weight * gains[far].max(initial=-np.inf))
+    best = int(np.argmax(other - winner))
+    chord, segment = divmod(best, SEGMENTS)
+    return SecondGrain(float((other - winner)[best]), CHORDS[chord], math.degrees(azimuths[segment]))
 
 
 class Surrogates(NamedTuple):

@@ -22,7 +22,7 @@ from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
-from apt_evap.maps.indexing.halves_and_surrogates import second_lattice, surrogates_of
+from apt_evap.maps.indexing.halves_and_surrogates import second_grain, second_lattice, surrogates_of
 from apt_evap.maps.indexing.joint_search import CONTRAST, COUNTED, JOINT, JointSearch
 from apt_evap.maps.indexing.marked_poles import Mark, check_places, contradictory_marks, contradictory_pair, marks_of
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns, mixture
@@ -46,11 +46,13 @@ CLEAR, UNSEEN = 60.0, -5.0
 """Evidence of the local contrast of a whole map from which on the winner must be seen in every half: with more than the
 second number, no crystal being 0. Bicrystals of twins with a second grain of 29 and 34 % have 134 and 118, and in a
 half -8 and -24; measured nickel 197 and 28, twins of tantalum and silver 95 and -2, 93 and 21."""
+SECOND_GRAIN = 20.0
+"""Evidence of a second grain in a segment above which a map may hold one, with the amplitudes of the winner."""
 ABOVE_SURROGATES = 3.0
 """Standard deviations above the surrogates of the map from which on a result is a crystal."""
 RIVAL = 20.0
-"""Evidence of another crystal structure over the own one above which the map is undecided; if it is less, and more than
--RIVAL, the map decides for the structure that was given, and the reason says so."""
+"""Evidence of another crystal structure over the own one above which the map is undecided, if the other one passes the
+same checks; from -RIVAL on the map decides for the structure that was given, and the reason names the other one."""
 EXCLUDED = 45.0
 """Evidence below the own one, on the grid of the search, at which another crystal structure is not refined."""
 LEAST_IONS = 4_000
@@ -371,13 +373,7 @@ def index(
             results = crystal.refined([Start(_matrix_at(disc.centre, *start), start[1].scale, 0.0)])
         told(_REFINED)
         dispersion = dispersion_of([item.fit for item in results])
-        results.sort(key=lambda item: -item.weight(dispersion))
-        group = point_group(material.structure)
-        different: list[Weighed] = []
-        for item in results:
-            if all(angle_between(item.fit, other.fit, group, disc.radius) > DIFFERENT for other in different):
-                different.append(item)
-        weights = np.array([item.weight(dispersion) for item in different])
+        different, weights = crystal.different(results, dispersion)
         contradiction = contradictory_pair(marks, disc.centre, bounds)
         contradiction = contradiction or contradictory_marks(marks, different[0].fit.deviations)
         result = _judged(measured, crystal, different, weights, n, contradiction)
@@ -416,6 +412,7 @@ class _Crystal:
     ) -> None:
         self.view, self.material, self.patterns, self.scales, self.bounds = view, material, patterns, scales, bounds
         self.marks = marks
+        self._known: dict[tuple, Any] = {}
         packaged = patterns is master_patterns(material.structure)
         self.terms = terms_of(material) if packaged else Terms(material, patterns)
 
@@ -439,52 +436,85 @@ class _Crystal:
 
     def refined(self, starts: Sequence[Start], n: int = _TO_THE_END) -> list[Weighed]:
         """Orientations, refined by both criteria; the best `n` by either to the end."""
-        results = weighed(self.view, self.terms, self.densities, starts, n, self.bounds, self.marks)
+        results = weighed(self.view, self.terms, self.densities, starts, n, self.bounds, self.marks, self._known)
         if self.bounds != self.scales:
             low, high = self.bounds
             results = [item for item in results if low * 1.001 < item.fit.scale_at_centre < high / 1.001] or results
         return results
 
+    def different(self, results: Sequence[Weighed], dispersion: float) -> tuple[list[Weighed], Floats]:
+        """Results that are different orientations or scales, the best one first, and their weights."""
+        group = point_group(self.material.structure)
+        different: list[Weighed] = []
+        for item in sorted(results, key=lambda item: -item.weight(dispersion)):
+            if all(angle_between(item.fit, other.fit, group, self.view.disc.radius) > DIFFERENT for other in different):
+                different.append(item)
+        return different, np.array([item.weight(dispersion) for item in different])
+
+    def refusal(self, best: Weighed) -> str:
+        """Why the best result is no single crystal, in one sentence; empty if it passes the checks it can fail."""
+        second, least = second_lattice(self.view, self.terms, best.fit)
+        if second > SECOND_LATTICE:
+            return (
+                "the map may hold a second lattice: in half of it another orientation has more evidence, by "
+                f"{_floor(second)} (at most {SECOND_LATTICE:g} is allowed); a map of one grain would help"
+            )
+        if best.evidence > CLEAR and least < UNSEEN:
+            return (
+                "the map may hold a second lattice: the local contrast of the whole map has evidence "
+                f"{_floor(best.evidence)} for the orientation, but {_floor(least)} in a half of it, less than no "
+                "crystal; a map of one grain would help"
+            )
+        grain = second_grain(self.view, self.terms, best.fit)
+        if grain.evidence > SECOND_GRAIN:
+            return (
+                f"the map may hold a second grain: farther than {grain.chord:g} radii towards {grain.azimuth:.0f} "
+                f"degrees another orientation has more evidence, by {_floor(grain.evidence)} (at most "
+                f"{SECOND_GRAIN:g} is allowed); a map of one grain would help"
+            )
+        surrogates = surrogates_of(self.view, self.search, self.terms, self.densities, self.bounds, best.fit)
+        if surrogates.above or surrogates.deviations <= ABOVE_SURROGATES:
+            return (
+                "maps with the same rings and lines at random azimuths are explained about as well: this one is "
+                f"{surrogates.deviations:.1f} standard deviations above their mean, {surrogates.above} of "
+                f"{len(surrogates.weights)} are above it (more than {ABOVE_SURROGATES:g}, and none, are needed); more "
+                "ions or a marked pole would help"
+            )
+        return ""
+
 
 def _checked(result, crystal, best, dispersion, weight, told):
     """The result of a map that prefers one orientation, if it passes the checks that it can fail, or undecided."""
-    undecided = replace(result, decided=False)
-    second, least = second_lattice(crystal.view, crystal.terms, best.fit)
-    if second > SECOND_LATTICE:
-        return replace(undecided, reason=(
-            "the map may hold a second lattice: in half of it another orientation has more evidence, by "
-            f"{_floor(second)} (at most {SECOND_LATTICE:g} is allowed); a map of one grain would help"
-        ))  # fmt: skip
-    if best.evidence > CLEAR and least < UNSEEN:
-        return replace(undecided, reason=(
-            "the map may hold a second lattice: the local contrast of the whole map has evidence "
-            f"{_floor(best.evidence)} for the orientation, but {_floor(least)} in a half of it, less than no crystal; "
-            "a map of one grain would help"
-        ))  # fmt: skip
-    surrogates = surrogates_of(crystal.view, crystal.search, crystal.terms, crystal.densities, crystal.bounds, best.fit)
-    if surrogates.above or surrogates.deviations <= ABOVE_SURROGATES:
-        return replace(undecided, reason=(
-            "maps with the same rings and lines at random azimuths are explained about as well: this one is "
-            f"{surrogates.deviations:.1f} standard deviations above their mean, {surrogates.above} of "
-            f"{len(surrogates.weights)} are above it (more than {ABOVE_SURROGATES:g}, and none, are needed); more ions "
-            "or a marked pole would help"
-        ))  # fmt: skip
+    if refusal := crystal.refusal(best):
+        return replace(result, decided=False, reason=refusal)
     told(_CHECKED)
-    excess, structure = _best_rival(crystal, dispersion, weight, told)
+    excess, rival = _best_rival(crystal, dispersion, weight, told)
+    if excess <= -RIVAL:
+        return result
+    name, structure = crystal.material.name, rival.material.structure
     if excess > RIVAL:
-        return replace(undecided, reason=f"a {structure} crystal explains the map better, by {_floor(excess)}")
-    if excess > -RIVAL:
-        name = crystal.material.name
+        # what nobody asked for needs the same proof
+        different, weights = rival.different(rival.refined(rival.starts()), dispersion)
+        preferred = len(weights) == 1 or weights[0] - weights[1] > DECIDED
+        if preferred and not rival.refusal(different[0]):
+            return replace(result, decided=False, reason=(
+                f"a {structure} crystal explains the map better, by {_floor(excess)}, and passes the same checks; is "
+                f"it {name}? A material with the structure {structure}, ions of {name} alone, or a marked pole would "
+                "help"
+            ))  # fmt: skip
         return replace(result, reason=(
-            f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(abs(excess))} "
-            f"{'more' if excess > 0 else 'less'}"
+            f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(excess)} more, "
+            "but does not pass the checks that this result passes"
         ))  # fmt: skip
-    return result
+    return replace(result, reason=(
+        f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(abs(excess))} "
+        f"{'more' if excess > 0 else 'less'}"
+    ))  # fmt: skip
 
 
 def _best_rival(crystal, dispersion, weight, told):
-    """Largest evidence of another crystal structure over the own one, and this structure."""
-    best = -math.inf, ""
+    """Largest evidence of another crystal structure over the own one, and this crystal."""
+    best = -math.inf, crystal
     for number, (structure, element) in enumerate(_TYPICAL.items()):
         told(_CHECKED + (1 - _CHECKED) * number / len(_TYPICAL))
         if structure == crystal.material.structure:
@@ -497,7 +527,8 @@ def _best_rival(crystal, dispersion, weight, told):
         for starts, to_the_end in ((_FEW_STARTS, _FEW_TO_THE_END), (_STARTS, _TO_THE_END)):
             results = rival.refined(rival.starts(starts), to_the_end)
             excess = max(item.weight(dispersion) for item in results) - weight
-            best = max(best, (excess, structure))
+            if excess > best[0]:
+                best = excess, rival
             if excess < -_HOPELESS:
                 break
     return best

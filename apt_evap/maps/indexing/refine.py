@@ -212,6 +212,7 @@ class _Likelihood:
         self._marks = marks
         self._bounds = (-math.inf, math.inf) if bounds is None else np.log(bounds)
         self._mark_places = [(mark.places - disc.centre) / disc.radius for mark in marks]
+        self._local: tuple[tuple[float, float], Floats] | None = None
         self.n_slow = bins.slow.shape[1]
         directions = self.mark_directions(geometry)
         self._targets = [mark.nearest(places) for mark, places in zip(marks, directions, strict=True)]
@@ -222,8 +223,12 @@ class _Likelihood:
 
     def _crystal_directions(self, places, geometry):
         """Directions in the crystal of places on the disc, shape (n, 3)."""
-        scale = float(np.exp(geometry[3]))
-        return directions_of(places, self._disc.radius, scale, geometry[4]) @ self.rotation(geometry)
+        scale, stretch = float(np.exp(geometry[3])), float(geometry[4])
+        if places is not self._bins.places:
+            return directions_of(places, self._disc.radius, scale, stretch) @ self.rotation(geometry)
+        if self._local is None or self._local[0] != (scale, stretch):  # rotations do not change them
+            self._local = (scale, stretch), directions_of(places, self._disc.radius, scale, stretch)
+        return self._local[1] @ self.rotation(geometry)
 
     def contrasts(self, geometry: Floats) -> Floats:
         """Densities in each bin, minus 1, shape (k, n)."""

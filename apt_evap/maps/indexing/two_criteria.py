@@ -9,7 +9,7 @@ that leaves structure unexplained decides less.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -86,6 +86,7 @@ def weighed(
     n: int,
     bounds: tuple[float, float],
     marks: Sequence[Mark] = (),
+    known: dict[tuple, Any] | None = None,
 ) -> list[Weighed]:
     """Refine orientations by both criteria.
 
@@ -105,6 +106,8 @@ def weighed(
         Smallest and largest scale [mm/rad].
     marks : sequence of Mark
         Marks of a user.
+    known : dict, optional
+        Refinements of the same map and crystal that are known already; those of this call are added.
 
     Returns
     -------
@@ -114,11 +117,19 @@ def weighed(
     disc, bins, picture = view
     group = point_group(terms.structure)
 
+    known = {} if known is None else known
+
     def by_likelihood(start, steps):
-        return refine(bins, disc, densities, start.matrix, start.scale, None, marks, steps, bounds)
+        key = start.matrix.tobytes(), start.scale, steps
+        if key not in known:
+            known[key] = refine(bins, disc, densities, start.matrix, start.scale, None, marks, steps, bounds)
+        return known[key]
 
     def by_contrast(start):
-        return refine_contrast(picture, disc.radius, terms, start, bounds)
+        key = start.matrix.tobytes(), start.scale
+        if key not in known:
+            known[key] = refine_contrast(picture, disc.radius, terms, start, bounds)
+        return known[key]
 
     starts = _distinct(starts, group)
     likely = [by_likelihood(start, _QUICK) for start in starts]
