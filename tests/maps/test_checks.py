@@ -7,8 +7,9 @@ import apt_evap as ae
 from apt_evap._common import blas_threads
 from apt_evap._common.blas_threads import one_blas_thread
 from apt_evap.maps.indexing import halves_and_surrogates as module
+from apt_evap.maps.indexing import index_map
 from apt_evap.maps.indexing.contrast_search import PIECES, evidence, places_of, terms_of
-from apt_evap.maps.indexing.halves_and_surrogates import HALVES, Surrogates, second_lattice
+from apt_evap.maps.indexing.halves_and_surrogates import HALVES, Surrogates, second_grain, second_lattice
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, disc_of, flattened_by_rings
 from apt_evap.maps.indexing.refine import directions_of, refine
@@ -59,6 +60,90 @@ def test_two_grains_are_not_indexed_as_one():
     _, both = two_grains()
     found = quickly(both)
     assert not found.decided and "second lattice" in found.reason
+
+
+@pytest.mark.slow
+def test_a_small_grain_at_the_rim_has_evidence_in_its_segment():
+    orientation, single = drawn((0.30, 0.54, 0.79))
+    _, other = drawn((0.1, 0.2, 0.97), 75.0, seed=2)
+    terms = terms_of(ae.material("Ni"))
+    view, fit = fit_of(single, orientation)
+    assert second_grain(view, terms, fit).evidence < -20
+    # 18 % of the area, towards 90 degrees
+    values = np.where(single.centres[1][:, None] > 0.52 * WIDTH / 2, other.values, single.values)
+    both = ae.DetectorMap.from_array(values, single.x_edges, single.y_edges, single.mask, is_counts=True)
+    view, fit = fit_of(both, orientation)
+    found = second_grain(view, terms, fit)
+    assert found.evidence > 40 and found.chord == 0.5 and found.azimuth == pytest.approx(90, abs=23)
+
+
+def test_the_evidence_of_a_segment_is_the_direct_one(monkeypatch):
+    """Of one axis and every azimuth, by sums over the points of a segment without Fourier transforms."""
+    orientation, map = drawn((0.30, 0.54, 0.79))
+    view, fit = fit_of(map, orientation)
+    terms = terms_of(ae.material("Ni"))
+    first_axis = module.axes_of("fcc", 3.0)[5:6]
+    for name, value in (("axes_of", lambda *arguments: first_axis), ("CHORDS", (0.3,)), ("_FREED", (0.0,))):
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(module, "_SEGMENT_SCALES", (1.0,))
+    monkeypatch.setattr(module, "SEGMENTS", 2)  # towards 0 and 180 degrees
+    places, areas = places_of()
+    local = directions_of(places, view.disc.radius, fit.scale, fit.stretch)
+    images = terms.images(view.disc.radius / fit.scale).astype(float)
+
+    def pictures(matrix):
+        shown = module.sampled(images, terms.equal(local @ matrix), terms.corner)
+        return shown - (shown @ areas)[:, None]
+
+    winner = pictures(fit.matrix)
+    norms = np.sqrt(winner**2 @ areas)
+    gram, cross = (winner * areas) @ winner.T / norms / norms[:, None], (winner * areas) @ view.picture / norms
+    amplitudes = module.exact_evidence(gram, cross, terms.priors, terms.signed)[1] / norms
+    left = areas @ (view.picture - amplitudes @ winner) ** 2
+
+    def gain(matrix, inside):
+        """Decrease of the squared deviations in a segment, both pictures without their means there."""
+        weights = areas * inside
+        shown, seen = (v - weights @ v / weights.sum() for v in (amplitudes @ pictures(matrix), view.picture))
+        return (weights @ seen**2 - weights @ (seen - shown) ** 2) * PIECES / left
+
+    (turn,) = [module.about_axis(axis) for axis in first_axis]
+    angles = np.arange(AZIMUTHS) * 2 * np.pi / AZIMUTHS
+    about = [np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]]) for a in angles]
+    matrices = [a @ t for a in about for t in (turn, np.diag([1.0, -1.0, 1.0]) @ -turn)]
+    direct = [
+        max(gain(matrix, inside) for matrix in matrices) - gain(fit.matrix, inside)
+        for inside in (places[:, 0] > 0.3, places[:, 0] < -0.3)
+    ]
+    assert second_grain(view, terms, fit).evidence == pytest.approx(max(direct), abs=0.05)
+
+
+@pytest.mark.parametrize("excess, proved, decided", [(30, True, False), (30, False, True), (50, False, False)])
+def test_another_structure_needs_the_same_proof(monkeypatch, excess, proved, decided):
+    """Refused if the other structure passes the checks of the own one, or is far better."""
+    result = index_map.Indexing(drawn((0.3, 0.5, 0.8), ions=5_000)[1], (), True, "best")
+
+    class Crystal:
+        material = ae.material("Ni")
+
+        def __init__(self, refused=""):
+            self.refused = refused
+
+        def refusal(self, best):
+            return self.refused
+
+        def starts(self):
+            return []
+
+        def refined(self, starts):
+            return []
+
+        def different(self, results, dispersion):
+            return [None, None], np.array([100.0, 60.0])
+
+    monkeypatch.setattr(index_map, "_best_rival", lambda *arguments: (excess, Crystal("" if proved else "a star")))
+    found = index_map._checked(result, Crystal(), None, 1.0, 70.0)
+    assert found.decided == decided and f"{excess}" in found.reason
 
 
 @pytest.mark.slow
@@ -180,6 +265,6 @@ def test_a_clear_map_is_seen_in_every_half(monkeypatch):
     _, single = drawn((0.30, 0.54, 0.79))
     found = quickly(single)
     assert found.decided
-    monkeypatch.setattr("apt_evap.maps.indexing.index_map.second_lattice", lambda *arguments: (-10.0, -6.0))
+    monkeypatch.setattr("apt_evap.maps.indexing.index_map.second_lattice", lambda *arguments: (-10.0, -99.0))
     found = quickly(single)
-    assert not found.decided and "second lattice" in found.reason and "-6 in a half" in found.reason
+    assert not found.decided and "second lattice" in found.reason and "-99 in a half" in found.reason
