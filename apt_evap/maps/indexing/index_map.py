@@ -49,8 +49,8 @@ degrees off, have -13 to 4, right ones 22 and more, measured tungsten 16 to 26."
 CLEAR, UNSEEN, PART = 50.0, -40.0, 0.25
 """Evidence of the local contrast of a whole map from which on the winner must have the second number, and this part of
 the evidence, in every half, no crystal being 0. Measured tungsten, cut at 60 mm and indexed as [001], has 58, and in a
-half -32, bicrystals 62 and -26, 134 and -24, 154 and -14; right twins 63 and -22, 76 and -11, 112 and -8, measured nickel
-197 and 28."""
+half -32, bicrystals 62 and -26, 134 and -24, 154 and -14; right twins 63 and -22, 76 and -11, 112 and -8, measured
+nickel 197 and 28."""
 SECOND_GRAIN = 20.0
 """Evidence of a second grain in a segment above which a map may hold one, with the amplitudes of the winner."""
 ABOVE_SURROGATES = 3.0
