@@ -19,6 +19,7 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.maps.density_gains import Densities, DensityGains, density_gains
 from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
@@ -80,6 +81,7 @@ _HOPELESS = 80.0  # evidence below the own one of these few, at which no more ar
 _TYPICAL = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}  # crystals of the patterns
 _SEARCHED, _REFINED, _CHECKED = 0.13, 0.25, 0.35  # parts of the time of a decided map, measured for nickel
 _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor: the stretch changes the scale
+_OTHER_SCALES = 1.12  # factor of the scales at which other crystals are searched for their densities
 _MAP_BINS = 128
 _SHOWN_SIGMA = 0.7  # smoothing of a pattern that is drawn [degrees]
 
@@ -218,6 +220,56 @@ class Indexing:
         """
         chosen = self.best if candidate is None else candidate
         return folded(self.map, chosen.projection, *chosen.orientation.nearest_pole(plane), **options)
+
+    def density_gains(
+        self, plane: Sequence[int], pattern: Densities | None = None, *, reach: float = 20.0, seed: int = 0
+    ) -> DensityGains:
+        """How much better a pattern reproduces the densities about a pole than drawn lines, or other crystals, do.
+
+        Parameters
+        ----------
+        plane : sequence of int
+            Miller indices of a family of planes; of its poles the one nearest to the axis.
+        pattern : callable, optional
+            Densities of shape (k, n) in the directions of the specimen (n, 3), such as those of a run; by default the
+            patterns of the package for the first candidate.
+        reach, seed
+            As for `maps.density_gains`.
+
+        Returns
+        -------
+        DensityGains
+            The other crystals are searched at scales within 12 % of that of the first candidate.
+        """
+        best = self.best
+        view = view_of(flattened_by_rings(disc_of(self.map)))
+        scale = best.projection.scale
+        bounds = scale / _OTHER_SCALES, scale * _OTHER_SCALES
+
+        def densities(orientation, projection):
+            patterns = master_patterns(orientation.material.structure)
+
+            def at(directions):
+                crystal = projection.directions(best.projection.places(directions)) @ orientation.matrix
+                return np.concatenate([each.at(crystal, sigma=_SHOWN_SIGMA) for each in patterns])
+
+            return at
+
+        others = []
+        with one_blas_thread():
+            for structure, element in _TYPICAL.items():
+                if structure == best.orientation.material.structure:
+                    continue
+                crystal = _Crystal(view, as_material(element), master_patterns(structure), bounds, bounds)
+                results = crystal.refined(crystal.starts(_FEW_STARTS), _FEW_TO_THE_END)
+                fit = crystal.different(results, dispersion_of([item.fit for item in results]))[0][0].fit
+                group = point_group(structure)
+                orientation = _orientation(crystal.material, fit.matrix, group[np.linalg.det(group) > 0])
+                others.append(densities(orientation, _projection(view.disc, fit, bounds)))
+            pattern = densities(best.orientation, best.projection) if pattern is None else pattern
+            return density_gains(
+                self.map, best.orientation, best.projection, pattern, plane, others=others, reach=reach, seed=seed
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result in plain types, without the map.
