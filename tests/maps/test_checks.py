@@ -142,7 +142,7 @@ def test_another_structure_needs_the_same_proof(monkeypatch, excess, proved, dec
             return [None, None], np.array([100.0, 60.0])
 
     monkeypatch.setattr(index_map, "_best_rival", lambda *arguments: (excess, Crystal("" if proved else "a star")))
-    found = index_map._checked(result, Crystal(), None, 1.0, 70.0)
+    found = index_map._checked(result, Crystal(), None, 1.0, 70.0, lambda part: None)
     assert found.decided == decided and f"{excess}" in found.reason
 
 
