@@ -207,6 +207,9 @@ def short_range_order(
     pairs = neighbour_pairs(places, high, low)
     k = int(labels.max()) + 1
     fractions = np.bincount(labels, minlength=k) / len(labels)
+    if k * k <= 256:
+        labels = labels.astype(np.uint8)  # the neighbours of an ion are anywhere in memory: 10 million fit in a cache
+    pairs = np.ascontiguousarray(pairs.T)
     counts = _counted(pairs, labels, k)
     shuffled = np.array([_parameters(_counted(pairs, random.permutation(labels), k), fractions) for _ in range(trials)])
     return ShortRangeOrder(
@@ -224,8 +227,8 @@ def neighbour_pairs(positions: Floats, high: float, low: float = 0.0) -> Integer
 
 
 def _counted(pairs, labels, k):
-    """Number of ordered pairs by species, shape (k, k)."""
-    numbers = np.bincount(labels[pairs[:, 0]] * k + labels[pairs[:, 1]], minlength=k * k).reshape(k, k)
+    """Number of ordered pairs of shape (2, m) by species, shape (k, k)."""
+    numbers = np.bincount(labels[pairs[0]] * labels.dtype.type(k) + labels[pairs[1]], minlength=k * k).reshape(k, k)
     return numbers + numbers.T
 
 
