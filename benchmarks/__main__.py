@@ -22,7 +22,7 @@ _RUNS = (
 COMMANDS = {
     **{f"run {name}": ("run", name) for name in _RUNS},
     "sweep plan sweep": ("sweep", "plan", "sweep"),
-    "sweep work sweep_runs": ("sweep", "work", "sweep_runs"),
+    "sweep work sweep": ("sweep", "work", "sweep"),
     "dataset dataset": ("dataset", "dataset"),
     "visible visible, first call": ("visible", "visible"),
     "visible visible, next calls": ("visible", "visible"),

@@ -112,7 +112,11 @@ def add_specimen(parser: argparse.ArgumentParser) -> Any:
     """Add options of the simulated specimen; return their group."""
     group = parser.add_argument_group("specimen")
     group.add_argument(
-        "--minutes", type=float, default=10.0, metavar="N", help="time that the simulation may take; default: 10"
+        "--minutes",
+        type=float,
+        default=10.0,
+        metavar="N",
+        help="time of the simulation, filled with ions; the fit of twin takes some minutes more; default: 10",
     )
     group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
     group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")

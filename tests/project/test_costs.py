@@ -35,7 +35,7 @@ def test_an_example_takes_as_long_as_its_first_line_says(name):
         ("run ni111", "README.md", "of a nickel tip in "),
         ("visible visible, first call", "examples/visible.toml", "be found? "),
         ("dataset dataset", "examples/dataset.toml", "nickel tips, "),
-        ("sweep work sweep_runs", "examples/sweep.toml", "nickel tips, "),
+        ("sweep work sweep", "examples/sweep.toml", "nickel tips, "),
     ],
 )
 def test_a_page_promises_what_was_measured(name, page, before):
