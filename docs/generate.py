@@ -41,6 +41,7 @@ _THUMBNAILS = {
     "precipitate_or_boundary": ("docs/howto/precipitate_or_boundary.png", (0.335, 0.04, 1.0, 0.5)),
     "visibility": ("articles/find_the_precipitate/find_the_precipitate.png", (0.34, 0.0, 1.0, 0.485)),
     "real_units": ("articles/microscope/course.png", (0.0, 0.0, 1.0, 1.0)),
+    "precipitate_size": ("docs/howto/precipitate_size.png", (0.0, 0.0, 0.5, 1.0)),
     "measure_clusters": ("docs/howto/clusters.png", (0.0, 0.0, 0.5, 0.5)),
     "explore": ("docs/howto/explore.png", (0.0, 0.0, 1.0, 1.0)),
     "sweep": ("articles/three_metals/predictions.png", (0.0, 0.02, 1.0, 0.66)),

@@ -72,6 +72,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     surface.add_argument(
         "--labels", metavar="COLUMN", help="a column of the ions with the number of their phase, in place of --solutes"
     )
+    surface.add_argument(
+        "--check",
+        action="store_true",
+        help="sizes of the phases that an evolving shape has found, with errors; simulates its specimen, and compares "
+        "the density on the detector: minutes",
+    )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
     add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
     constants.add_argument("--element", metavar="NAME", help=f"gives atomic volume and field: {MATERIAL_HELP}")
@@ -116,6 +122,9 @@ def execute(options: argparse.Namespace) -> int:
     file = file_of(options)
     if options.species is None:  # ranges are then for the picture and the solutes
         file = replace(file, ranges=None)
+    if options.check and (options.shape == "cap" or "element" not in settings):
+        got = f"--shape {options.shape}" if options.shape == "cap" else "no --element"
+        raise ValueError(f"--check needs --shape evolving and --element, got {got}")
     origins = None if options.origins is None else OriginTable.load(options.origins)
     selection = file.select(hits, note)
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
@@ -138,6 +147,8 @@ def execute(options: argparse.Namespace) -> int:
     result["assumed"] = [one._asdict() for one in assumed]
     if isinstance(reconstruction, EvolvingReconstruction):
         result["surface"] = _tell_surface(options, reconstruction)
+    if options.check:
+        result["check"] = _tell_check(options, reconstruction)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -209,6 +220,23 @@ def _tell_surface(options, reconstruction):
             "model_voltage": history.model_voltage.tolist(),
         }
     return found
+
+
+def _tell_check(options, reconstruction):
+    """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
+    from apt_evap.reconstruction.phase_size import phase_sizes
+    from apt_evap.reconstruction.specimen_check import check_specimen
+
+    if not any(phase.error == phase.error for phase in reconstruction.phases):
+        tell(options, "nothing to check: no evaporation field of a phase was found")
+        return None
+    sizes = phase_sizes(reconstruction)
+    for size in sizes:
+        tell(options, str(size))
+    check = check_specimen(reconstruction)
+    tell(options, str(check))
+    found = {"explained": check.explained, "error": check.error, "confirmed": check.is_confirmed, "ions": check.ions}
+    return found | {"sizes": [size._asdict() for size in sizes]}
 
 
 def _ions(options):

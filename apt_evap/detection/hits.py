@@ -153,6 +153,8 @@ class Hits:
             object.__setattr__(self, name, dict(mapping))
         self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
         check_kind(self.source, "source", str, "text")
+        if self.ranges is not None:
+            check_kind(self.ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
         if self.extent is not None:
             check_array(self.extent, "extent", (4,))
         lengths.update((name, len(values)) for name, values in self.extra.items())

@@ -8,10 +8,12 @@ from .evolving import EvolvingReconstruction as EvolvingReconstruction
 from .lattice_planes import LatticePlanes as LatticePlanes
 from .lattice_planes import find_planes as find_planes
 from .origins import origin_table as origin_table
+from .phase_size import phase_sizes as phase_sizes
 from .position_errors import local_scatter as local_scatter
 from .position_errors import position_covariances as position_covariances
 from .precipitate import precipitate_errors as precipitate_errors
 from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
 from .shank import fit_shank as fit_shank
+from .specimen_check import check_specimen as check_specimen
 from .truth_comparison import compare_with_truth as compare_with_truth
 from .truth_comparison import corrected as corrected

@@ -21,6 +21,7 @@ _FEWEST = 50  # ions of a plane
 _RING_FROM = 0.75  # of the half angle of the field of view, for what lies beyond it
 _SECTORS = 8
 _BIN = 0.25  # nm, of the depth in the ring
+_TURNS = 6  # of the search for a plane
 _PLANE_BIN = 0.2  # nm, across a plane
 
 
@@ -64,7 +65,7 @@ class Feature:
         counted = ions * 2 * np.sqrt(np.pi) * blocks_wide
         noise = np.sqrt(self.background * (1 - self.background) / counted) / contrast
         beyond = (share > RING_GATE) & (share > _SURE * noise)
-        return float(share.max()), bool(beyond.any())
+        return float(min(share.max(), 1.0)), bool(beyond.any())
 
 
 @dataclass(frozen=True)
@@ -129,13 +130,13 @@ def continued(
 def _plane(feature, positions):
     """Excess of the field as a function of the place across a plane, how flat the ions are, and the normal."""
     chosen = feature.members
-    for _ in range(3):  # ions beyond 2.5 half widths are left out
+    for _ in range(_TURNS):  # ions beyond two half widths are left out
         ions, weights = positions[chosen], feature.membership[chosen]
         middle = np.average(ions, axis=0, weights=weights)
         spread, axes = np.linalg.eigh(np.cov((ions - middle).T, aweights=np.maximum(weights, 0)))
         normal, half = axes[:, 0], np.sqrt(3 * max(spread[0], 1e-9))
         across = (positions - middle) @ normal
-        chosen = feature.members & (np.abs(across) < 2.5 * half)
+        chosen = feature.members & (np.abs(across) < 2 * half)
     edges = np.arange(-3 * half, 3 * half, _PLANE_BIN)
     bins = np.digitize(across, edges)
     ions = np.bincount(bins, minlength=len(edges) + 1)

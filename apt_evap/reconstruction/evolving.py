@@ -22,7 +22,9 @@ from apt_evap.detection.hits import Hits
 from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
 from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence, SurfacePass
+from apt_evap.reconstruction.found_region import found_tip
 from apt_evap.reconstruction.local_composition import (
+    CONTRAST_GATE,
     SoluteContrast,
     contents,
     local_composition,
@@ -32,6 +34,9 @@ from apt_evap.reconstruction.local_composition import (
 )
 from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruction
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings, slope_of_shank
+from apt_evap.reconstruction.voltage_course import smoothed, without_jumps
+from apt_evap.specimen.materials import Material, as_material
+from apt_evap.specimen.tip import Tip
 from apt_evap.spectra.mass_ranges import Ranges
 
 FEWEST_IONS = 2000
@@ -225,6 +230,12 @@ class EvolvingReconstruction(Reconstruction):
         """Ions of the passes in which the fields were found: every n-th of many."""
         return self._followed[0].ions  # type: ignore[no-any-return]
 
+    @property
+    def found_features(self) -> list[tuple[PhaseField, Feature]]:
+        """Each of `phases` whose contrast was seen, and its ions of `sequence`."""
+        seen = [one for one in self.phases if not one.contrast < CONTRAST_GATE]
+        return list(zip(seen, self._followed[1].features, strict=True))
+
     def again(self, ions: IonSequence, rows: slice = slice(None)) -> Floats:
         """Positions out of the specimen [nm] of some ions of `sequence`, perhaps changed, with the same fields.
 
@@ -250,6 +261,53 @@ class EvolvingReconstruction(Reconstruction):
         outside = continued(features, first.positions, ions.in_ring)[0]
         return surface.integrate(voltages, fixed.fields[rows], outside, "surface").positions
 
+    def specimen(
+        self,
+        material: Material | str | None = None,
+        *,
+        axis: Sequence[float] = (0, 0, 1),
+        radius: float | None = None,
+        phases: bool = True,
+    ) -> Tip:
+        """Specimen with the phases where they were found, and the evaporation fields that were found.
+
+        Parameters
+        ----------
+        material : Material or str, optional
+            Crystal of matrix and phases; by default the element of the reconstruction.
+        axis : sequence of float
+            Crystal direction along the axis.
+        radius : float, optional
+            Radius of the apex [nm], for a specimen of the same shape and another size; by default the first radius of
+            the reconstruction.
+        phases : bool
+            Whether it has the phases; False for the matrix alone.
+
+        Returns
+        -------
+        Tip
+
+        Raises
+        ------
+        ValueError
+            If the reconstruction has found no evaporation fields, or no material is known.
+        """
+        if self._followed is None or self._followed[1].way != "surface":
+            raise ValueError(
+                f"the reconstruction must have found evaporation fields by voltage and phases, got {self.verdict!r}"
+            )
+        chosen = self.settings.element if material is None else material
+        if chosen is None:
+            raise ValueError("material must be given for a reconstruction without element, got None for both")
+        ions = self.sequence
+        every = -(-len(self) // len(ions.directions))
+        positions = self.specimen_positions[::every] + np.array([0.0, 0.0, ions.radius])
+        size = ions.radius if radius is None else check_number(radius, "radius", above=0, unit="nm")
+        found = (
+            [(one.name, replace(feature, ratio=one.ratio)) for one, feature in self.found_features] if phases else []
+        )
+        return found_tip(positions, ions, found, as_material(chosen), axis, size)
+
     def __repr__(self) -> str:
         fields = "".join(f"; {phase.name} {phase.ratio:.3f} ± {phase.error:.3f}" for phase in self.phases)
         return f"{super().__repr__()[:-1]}; {self.verdict}{fields}>"
@@ -263,6 +321,7 @@ class _Measured(NamedTuple):
     names: tuple[str, ...]
     own: tuple[Booleans, ...]  # ions of each label or solute
     has_labels: bool
+    jumps: int  # of the voltage that were taken out
 
     def part(self, first: int, every: int) -> _Measured:
         """Every n-th ion."""
@@ -327,10 +386,10 @@ def follow_surface(
     if math.degrees(rim) > WIDEST_VIEW:
         return _as_cap(cap, f"a half angle of {math.degrees(rim):.0f} degrees on the cap, above {WIDEST_VIEW:.0f}")
     places, angles = cap.geometry.places(cap.hits, cap.radii)
-    radius, growth = _growth_of(cap)
+    voltages, factors, jumps, why = _relative_voltages(cap.hits, cap)
+    radius, growth = _growth_of(cap, factors if jumps else 1.0)
     ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius, growth)
-    voltages, why = _relative_voltages(cap.hits, ions)
-    measured = _Measured(ions, voltages, names, own, labels is not None)
+    measured = _Measured(ions, voltages, names, own, labels is not None, jumps)
     every = -(-len(cap) // _ION_LIMIT)
     thinned = measured.part(0, every) if every > 1 else measured
     fixed = _fixed_point(thinned)
@@ -418,12 +477,12 @@ def _as_cap(cap, reason):
     return EvolvingReconstruction(**columns, verdict=f"cap: {reason}")
 
 
-def _growth_of(cap):
-    """Radius of the cap at the first ion [nm], and its increase per depth."""
+def _growth_of(cap, factors):
+    """Radius of the cap at the first ion [nm], and its increase per depth; factors take out jumps of the voltage."""
     settings = cap.settings
     if settings.mode == "shank":
         return settings.initial_radius, slope_of_shank(settings.shank_angle)
-    radii, depths = cap.radii, cap.depths
+    radii, depths = cap.radii * (factors if settings.mode == "voltage" else 1.0), cap.depths
     if np.ptp(radii) == 0:
         return float(radii[0]), 0.0
     # a straight line through the medians of 40 sections: a phase of another field is not a change of the radius
@@ -436,22 +495,20 @@ def _growth_of(cap):
     return float(max(start + slope * depths[0], 1e-3)), growth
 
 
-def _relative_voltages(hits, ions):
-    """Voltage of each ion over its mean, averaged over a depth, or None and why."""
+def _relative_voltages(hits, cap):
+    """Voltage of each ion over its mean, averaged over a depth, what was taken out, their number; or None and why."""
     if hits.voltage is None:
-        return None, "no voltage"
+        return None, None, 0, "no voltage"
     total = voltages_of(hits)
     if np.ptp(total) <= _CONSTANT * total.mean():
-        return None, f"a constant voltage of {total[0]:g} V"
-    width = _SMOOTHING * ions.radius / ions.depths[-1] * len(total)
-    # of means of blocks, an eighth as wide: a Gaussian over 10,000 ions at each of a million takes a minute
-    size = max(1, int(width / 8))
-    starts = np.arange(0, len(total), size)
-    sizes = np.diff(np.append(starts, len(total)))
-    means = np.add.reduceat(total, starts) / sizes
-    means = scipy.ndimage.gaussian_filter1d(means, max(width / size, 1.0), mode="nearest")
-    smooth = np.interp(np.arange(len(total)), starts + (sizes - 1) / 2, means)
-    return smooth / smooth.mean(), ""
+        return None, None, 0, f"a constant voltage of {total[0]:g} V"
+    if total.min() <= 0:
+        row = int(total.argmin())
+        raise ValueError(f'voltage must be > 0 V with shape="evolving", got {total[row]:g} V at ion {row}')
+    width = _SMOOTHING * float(np.median(cap.radii)) / max(float(np.ptp(cap.depths)), 1e-9) * len(total)
+    factors, jumps = without_jumps(total, width)
+    smooth = smoothed(total * factors, width)
+    return smooth / smooth.mean(), factors, jumps, ""
 
 
 def _fixed_point(measured):
@@ -675,4 +732,5 @@ def _verdict(fixed, measured, why):
     how = {way.way for way in fixed.ways} - {"none"}
     ways = {"plane": "continued as a plane", "ring": "continued from the ions at its azimuth"}
     beyond = f", {' and '.join(ways[way] for way in sorted(how))}" if how else ""
-    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{beyond}"
+    jumps = f"; {measured.jumps} jumps or restarts of the voltage were taken out" if measured.jumps else ""
+    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{beyond}{jumps}"

@@ -20,6 +20,7 @@ ALUMINIUM = ae.material("Al")
 VOLUME = ALUMINIUM.a**3 / 4  # nm^3
 R = 12.0  # nm
 COVER, BELOW, SIZE = 0.8, 1.2, 3.2  # nm: matrix above and below a sphere, its radius
+SMALL = 2.2  # nm: radius of a sphere in a large specimen
 ROLLING = 3.25  # energies at 1,000 V over those at the voltage of a measurement
 
 
@@ -35,11 +36,11 @@ def ball(tilt, azimuth, radius, cover, apex=R):
     return ae.specimen.Sphere(tuple((apex - cover - radius) * way), radius)
 
 
-def layer(ratio, tilt, width=2.4):
+def layer(ratio, tilt, width=2.4, apex=R):
     """A layer through the place of the sphere, its normal at an angle from the axis [degrees]."""
     theta = np.radians(tilt)
     normal = np.array((0.8 * np.sin(theta), 0.6 * np.sin(theta), np.cos(theta)))
-    middle = normal[2] * (R - COVER - SIZE)
+    middle = normal[2] * (apex - COVER - SIZE)
     return phase("layer", ae.specimen.Layer(middle - width / 2, middle + width / 2, tuple(normal)), ratio)
 
 
@@ -57,53 +58,56 @@ def alloy(region, share):
 
 
 def case(name):
-    """Phases beside the matrix, angle of the shank [degrees] and emissions of a case."""
-    shank, emissions = 1.5, {"rest": ae.Unperturbed()}
-    if name.endswith("_shank"):
-        name, shank = name.removesuffix("_shank"), 6.0
-    elif name.endswith("_rolled"):
-        name = name.removesuffix("_rolled")
+    """Phases beside the matrix, angle of the shank [degrees], emissions and radius of the apex [nm] of a case."""
+    name, *words = name.split("-")
+    shank = next((float(word.removeprefix("shank")) for word in words if word.startswith("shank")), 1.5)
+    apex = next((float(word.removeprefix("R")) for word in words if word.startswith("R")), R)
+    emissions = {"rest": ae.Unperturbed()}
+    if "rolled" in words:
         emissions["metal"] = ae.RollUp.of_metal("Al", energy_scale=ROLLING)
         emissions["all"] = ae.RollUp(ae.TruncatedNormal(0.3 * ROLLING, 0.3 * ROLLING))
     phases = {
         "pure": lambda: [],
-        "sphere_low": lambda: [sphere("sphere", 0.8)],
-        "sphere_low_off": lambda: [sphere("sphere", 0.8, 20)],
-        "sphere_high": lambda: [sphere("sphere", 1.2)],
-        "sphere_edge": lambda: [sphere("sphere", 0.85, 31, radius=2.4)],
-        "layer_high": lambda: [layer(1.15, 0)],
-        "layer_low": lambda: [layer(0.85, 0)],
-        "layer40_high": lambda: [layer(1.15, 40)],
-        "layer40_low": lambda: [layer(0.85, 40)],
+        "sphere_low": lambda: [sphere("sphere", 0.8, apex=apex)],
+        "sphere_low_off": lambda: [sphere("sphere", 0.8, 20, apex=apex)],
+        "sphere_small": lambda: [sphere("sphere", 0.8, radius=SMALL, apex=apex)],
+        "sphere_high": lambda: [sphere("sphere", 1.2, apex=apex)],
+        "sphere_edge": lambda: [sphere("sphere", 0.85, 31, radius=2.4, apex=apex)],
+        "layer_high": lambda: [layer(1.15, 0, apex=apex)],
+        "layer_low": lambda: [layer(0.85, 0, apex=apex)],
+        "layer40_high": lambda: [layer(1.15, 40, apex=apex)],
+        "layer40_low": lambda: [layer(0.85, 40, apex=apex)],
         "two_spheres": lambda: [
-            sphere("low", 0.8, 14, 0, 1.8, 0.6),
-            sphere("high", 1.2, 16, 200, 1.8, 1.8),
+            sphere("low", 0.8, 14, 0, 1.8, 0.6, apex),
+            sphere("high", 1.2, 16, 200, 1.8, 1.8, apex),
         ],
         "core_shell": lambda: [
-            phase("shell", ball(0, 0, 3.0, 0.8), 1.15),
-            phase("core", ball(0, 0, 1.7, 2.1), 0.85),
+            phase("shell", ball(0, 0, 3.0, 0.8, apex), 1.15),
+            phase("core", ball(0, 0, 1.7, 2.1, apex), 0.85),
         ],
     }
     if name == "alloy_sphere":
-        return alloy(ball(0, 0, SIZE, COVER), 0.4), shank, emissions
-    return [ae.specimen.Phase("matrix", ALUMINIUM), *phases[name]()], shank, emissions
+        return alloy(ball(0, 0, SIZE, COVER, apex), 0.4), shank, emissions, apex
+    return [ae.specimen.Phase("matrix", ALUMINIUM), *phases[name]()], shank, emissions, apex
 
 
 CASES = (
-    "pure:1 sphere_low_rolled:1 layer_high_rolled:1 layer40_high:1 sphere_low_off:1 layer_low:1 sphere_high:1 "
-    "two_spheres:1 layer40_low:1 layer_high_shank:1 sphere_edge:1 core_shell:1 alloy_sphere:1 sphere_low:2 layer_high:2"
+    "pure:1 sphere_low-rolled:1 layer_high-rolled:1 layer40_high:1 sphere_low_off:1 layer_low:1 sphere_high:1 "
+    "sphere_edge:1 sphere_low:2 layer_high:2 sphere_high:2 core_shell:1 two_spheres:1 layer_low-shank10:1 "
+    "sphere_low_off-shank5:2 layer40_low:1 sphere_small-R20:1 alloy_sphere:1"
 ).split()  # fmt: skip
 
 
 def evaporate(name, seed, folder):
     """Evaporate a case and keep what a reconstruction and its judgement need."""
-    phases, shank, emissions = case(name)
+    phases, shank, emissions, apex = case(name)
     offset = 100 * seed + sum(map(ord, name)) % 97
     tip = ae.Tip(
-        phases=phases, apex_radius=R, axis=(0, 1, 2), shank_angle=shank, shank_length=2 * R, depth=11.0,
+        phases=phases, apex_radius=apex, axis=(0, 1, 2), shank_angle=shank, shank_length=2 * apex, depth=11.0,
         offset_seed=offset, seed=offset,
     )  # fmt: skip
-    ions = round((COVER + 2 * SIZE + BELOW) * np.pi * R**2 / VOLUME, -3)
+    size = SMALL if name.startswith("sphere_small") else SIZE
+    ions = round((COVER + 2 * size + BELOW) * np.pi * apex**2 / VOLUME, -3)
     simulation = ae.Simulation(tip, seed=offset, rule=ae.ConstantPotential(), n_threads=1)
     run = simulation.run(int(ions), list(emissions.values()), responses=False, progress=False)
     kept = {"sites": run.emissions.positions, "phase": run.phase, "species": run.species}

@@ -3,13 +3,15 @@ Cap and evolving surface beside the truth
 =========================================
 
 Reconstructs the runs of ``runs.py`` by the cap and by a surface that follows the ions, with the true phase of each ion
-and with the local composition of a solute, and compares both with the true sites: errors, sizes, densities, ions on the
+and with the local composition of solutes, and compares both with the true sites: errors, sizes, densities, ions on the
 wrong side of an interface, evaporation fields, and how often the intervals of the positions hold the truth. Radius and
-compression are those that fit the run of pure aluminium; the efficiency is known. ``python table.py -i runs -o out``
-prints the table and writes ``table.rst`` and ``sections.png``.
+compression are those that fit the run of pure aluminium; the efficiency is known. Other rows have a voltage with noise,
+a jump and a restart, or constants that are wrong by 5 %, drawn at random. ``python table.py -i runs -o out`` prints the
+table and writes ``cases.json``, ``table.rst`` (median and range over the cases), and ``sections.png``.
 """
 
 import argparse
+import json
 import time
 from pathlib import Path
 
@@ -19,19 +21,22 @@ import scipy
 
 import apt_evap as ae
 
-RADIUS, COMPRESSION = 12.963, 1.0342  # fitted to the sites of the pure run
+RADIUS, COMPRESSION = 12.963, 1.0342  # fitted to the sites of the pure run, R = 12 nm
 EFFICIENCY, HALF_ANGLE, DISTANCE = 0.5, 30.0, 100.0
-SHARES = (0.02, 0.4, 0.1)  # of a solute in the matrix and in the phases
-CHOSEN_ON = ("pure_1", "sphere_low_rolled_1", "layer_high_rolled_1", "layer40_high_1")
+CONTRASTS = {"solute": 0.4, "20/2 %": 0.2, "6/2 %": 0.06}  # content of the phases, 2 % in the matrix
+CHOSEN_ON = ("pure_1", "sphere_low-rolled_1", "layer_high-rolled_1", "layer40_high_1")
 PHASE_FIELDS = {
-    "sphere_low": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2], "sphere_edge": [0.85], "layer_high": [1.15],
+    "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
+    "sphere_edge": [0.85], "layer_high": [1.15],
     "layer_low": [0.85], "layer40_high": [1.15], "layer40_low": [0.85], "two_spheres": [0.8, 1.2],
     "core_shell": [1.15, 0.85], "pure": [],
 }  # fmt: skip
+EXACT = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+DRAWS = 4  # of wrong constants
 
 
-def detected(path, emission="rest", seed=7):
-    """Ions that the detector recorded: hits with a voltage and a solute that is drawn, sites and phases."""
+def detected(path, emission="rest", way="labels", seed=7):
+    """Ions that the detector recorded: hits with a voltage and solutes that are drawn, sites and phases."""
     kept = np.load(path)
     places = kept[emission].astype(float)
     rho = np.hypot(*places.T)
@@ -41,19 +46,32 @@ def detected(path, emission="rest", seed=7):
     # the voltage of a rate that is controlled: that of the sites, averaged over 0.15 nm of 8.4 nm
     voltage = scipy.ndimage.gaussian_filter1d(kept["voltage"], 0.15 / 8.4 * len(rows), mode="nearest")
     phase = kept["phase"].astype(int)
-    solute = rng.random(len(phase)) < np.array(SHARES)[np.minimum(phase, 2)]
+    content = np.where(phase > 0, CONTRASTS.get(way, 0.4), 0.02)
+    element = np.where(rng.random(len(phase)) < content, "Cu", "Al")
     if path.stem.startswith("alloy"):  # in the others the species is that of the phase
-        solute = kept["species"] > 0
-    element = np.where(solute, "Cu", "Al")
-    hits = ae.Hits(x=places[rows, 0], y=places[rows, 1], voltage=voltage[rows], extra={"element": element[rows]})
+        element = np.where(kept["species"] > 0, "Cu", "Al")
+    if way == "two solutes":
+        element = np.where(element == "Al", "Al", np.where(rng.random(len(phase)) < 0.5, "Cu", "Mg"))
+        element[(element != "Al") & (phase == 1)], element[(element != "Al") & (phase == 2)] = "Cu", "Mg"
+    voltage, element, n = voltage[rows], element[rows], int(rows.sum())
+    if way == "noisy voltage":  # 0.5 % from ion to ion, and 0.5 % that wanders over 2 % of the ions
+        slow = scipy.ndimage.gaussian_filter1d(rng.normal(size=n), n / 50)
+        voltage = voltage * (1 + 0.005 * rng.normal(size=n) + 0.005 * slow / slow.std())
+    elif way == "jump and restart":  # 4 % at once, and a start at 0.9 that recovers over 0.5 % of the ions
+        voltage = voltage * np.where(np.arange(n) > 0.6 * n, 1.04, 1.0) * (1 + 0.002 * rng.normal(size=n))
+        since = np.arange(n) - round(0.35 * n)
+        voltage *= np.where(since >= 0, 1 - 0.1 * np.exp(-np.maximum(since, 0) / (0.005 * n)), 1.0)
+    hits = ae.Hits(x=places[rows, 0], y=places[rows, 1], voltage=voltage, extra={"element": element})
     return hits, kept["sites"][rows], phase[rows]
 
 
-def reconstructed(hits, **how):
-    """Reconstruction with the constants of all cases."""
+def reconstructed(hits, factors=(1.0, 1.0, 1.0), **how):
+    """Reconstruction with the constants of all cases, times factors of compression, radius and efficiency."""
+    how = {name: how[name] * factors[1] if name in ("radius", "initial_radius") and how[name] != "shank" else how[name]
+           for name in how}  # fmt: skip
     return ae.reconstruct(
         hits, atomic_volume=runs.VOLUME, distance=DISTANCE, detector_radius=DISTANCE * np.tan(np.radians(HALF_ANGLE)),
-        efficiency=EFFICIENCY, projection="compressed", compression=COMPRESSION, **how,
+        efficiency=EFFICIENCY * factors[2], projection="compressed", compression=COMPRESSION * factors[0], **how,
     )  # fmt: skip
 
 
@@ -91,35 +109,60 @@ def measured(found, sites, phase, regions):
     return row
 
 
-def coverage(found, sites):
+def coverage(found, sites, errors):
     """Part of the ions whose true site is within 1 and 2 standard deviations, lateral and in depth."""
-    covariances = ae.reconstruction.position_covariances(found)
+    covariances = ae.reconstruction.position_covariances(found, errors)
     errors = found.specimen_positions - sites
     ratio = np.abs(errors - errors.mean(axis=0)) / np.sqrt(np.einsum("nii->ni", covariances))
     return [float((part < sigmas).mean()) for sigmas in (1, 2) for part in (ratio[:, :2], ratio[:, 2])]
 
 
+def ways_of(base, emission, regions):
+    """Methods beside the cap, and how each calls for its phases."""
+    if not regions:
+        return {"ring": ()}
+    ways = {"labels": None}
+    if emission == "rest":
+        ways |= dict.fromkeys(CONTRASTS, ("Cu",))
+        ways |= {"noisy voltage": None, "jump and restart": None, "wrong constants": None}
+    if base == "alloy_sphere":
+        return {"labels": None, "solute": ("Cu",)}
+    if base == "two_spheres":
+        ways["two solutes"] = ("Cu", "Mg")
+    return ways
+
+
 def compare(path, emission="rest"):
     """One case by all methods: rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
-    base = name.removesuffix("_rolled").removesuffix("_shank")
+    base = name.split("-")[0]
+    phases, shank, _, apex = runs.case(name)
+    regions = [one.region for one in phases[1:]]
+    radius = RADIUS * apex / runs.R
+    growth = {"radius": radius}
+    if shank > 1.5:
+        growth = {"radius": "shank", "initial_radius": radius, "shank_angle": shank}
     hits, sites, phase = detected(path, emission)
-    regions = [one.region for one in runs.case(name)[0][1:]]
-    growth = {"radius": RADIUS}
-    if name.endswith("_shank"):
-        growth = {"radius": "shank", "initial_radius": RADIUS, "shank_angle": 6.0}
     rows = {"cap": measured(reconstructed(hits, **growth), sites, phase, regions)}
-    ways = {"labels": {"labels": phase}, "solute": {"solutes": ("Cu",)}} if regions else {"ring": {}}
-    if emission != "rest":
-        del ways["solute"]
-    for way, how in ways.items():
+    rng = np.random.default_rng(sum(map(ord, path.stem)))
+    for way, solutes in ways_of(base, emission, regions).items():
+        hits, sites, phase = detected(path, emission, way)
+        how = {"labels": phase} if solutes is None else {"solutes": solutes}
         start = time.process_time()
+        if way == "wrong constants":
+            held = []
+            for _ in range(DRAWS):
+                found = reconstructed(hits, 1 + 0.05 * rng.normal(size=3), shape="evolving", **growth, **how)
+                if found.history is not None:
+                    held.append(coverage(found, sites, None))
+            rows[way] = {"coverage": np.mean(held, axis=0).tolist()} if held else {}
+            continue
         found = reconstructed(hits, shape="evolving", **growth, **how)
         row = measured(found, sites, phase, regions)
         row["seconds"] = time.process_time() - start
         row["verdict"], row["fields"] = found.verdict, [(one.ratio, one.error) for one in found.phases]
-        if emission == "rest" and found.history is not None and way != "solute":
-            row["coverage"] = coverage(found, sites)
+        if emission == "rest" and found.history is not None and way in ("labels", "ring"):
+            row["coverage"] = coverage(found, sites, EXACT)
         rows[way] = row
     true = PHASE_FIELDS.get(base, [])
     return {"name": path.stem + ("" if emission == "rest" else f" ({emission})"), "true": true, "rows": rows}
@@ -129,12 +172,39 @@ def lines_of(case):
     """Lines of the table, one for each method."""
     for way, row in case["rows"].items():
         phases = "; ".join(
-            f"{one['wide']:.2f} / {one['thick']:.2f}, {one['density']:.2f}, {one['wrong']:.2f}" for one in row["phases"]
+            f"{one['wide']:.2f} / {one['thick']:.2f}, {one['density']:.2f}, {one['wrong']:.2f}"
+            for one in row.get("phases", [])
         )
         fields = "; ".join(f"{ratio:.3f} ± {error:.3f}" for ratio, error in row.get("fields", []))
         held = " / ".join(f"{part:.2f}" for part in row.get("coverage", []))
-        errors = f"{row['lateral']:.3f} / {row['depth']:.3f}"
+        errors = f"{row['lateral']:.3f} / {row['depth']:.3f}" if "lateral" in row else ""
         yield [case["name"], way, errors, phases, fields, held], row.get("verdict", "")
+
+
+def summary(cases):
+    """Lines of the table of medians and ranges over the cases, one for each method."""
+
+    def over(values, digits=2):
+        values = np.asarray(values, float).ravel()
+        if not len(values):
+            return ""
+        return f"{np.median(values):.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
+
+    for way in dict.fromkeys(way for case in cases for way in case["rows"]):
+        rows = [(case["rows"][way], case["rows"]["cap"]) for case in cases if way in case["rows"]]
+        followed = [(row, cap) for row, cap in rows if not row.get("verdict", "").startswith("cap")]
+        phases = [one for row, _ in followed for one in row.get("phases", [])]
+        held = np.array([row["coverage"] for row, _ in followed if "coverage" in row])
+        yield [
+            way, f"{len(followed)} of {len(rows)}",
+            over([row["lateral"] for row, _ in followed if "lateral" in row]),
+            over([row["depth"] for row, _ in followed if "depth" in row]),
+            over([row["lateral"] / cap["lateral"] for row, cap in followed if "lateral" in row]),
+            over([row["depth"] / cap["depth"] for row, cap in followed if "lateral" in row]),
+            over([one[side] for one in phases for side in ("wide", "thick")]),
+            over([one["density"] for one in phases]), over([one["wrong"] for one in phases]),
+            " / ".join(f"{part:.2f}" for part in held.mean(axis=0)) if len(held) else "",
+        ]  # fmt: skip
 
 
 def draw(paths, output):
@@ -170,21 +240,29 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-i", "--input", type=Path, default=Path("runs"), help="folder of the runs; default: runs")
     parser.add_argument("-o", "--output", type=Path, default=Path(), help="folder of table and picture")
+    parser.add_argument("--only", nargs="*", metavar="NAME_SEED", help="cases; default: all, and the picture")
     options = parser.parse_args()
+    kept = options.output / "cases.json"
+    cases = json.loads(kept.read_text()) if options.only and kept.exists() else {}
     paths = sorted(options.input.glob("*.npz"))
-    table = [".. list-table::\n   :header-rows: 1\n"]
-    header = ["case", "method", "lateral / depth [nm]", "width / thickness, density, wrong side", "field", "coverage"]
-    table.append("   * - " + "\n     - ".join(header))
-    for path in sorted(paths, key=lambda path: path.stem not in CHOSEN_ON):
-        for emission in ("rest", "metal", "all") if "_rolled" in path.stem else ("rest",):
-            for row, verdict in lines_of(compare(path, emission)):
+    for path in paths:
+        if options.only and path.stem not in options.only:
+            continue
+        for emission in ("rest", "metal", "all") if "-rolled" in path.stem else ("rest",):
+            case = compare(path, emission)
+            cases[case["name"]] = case
+            for row, verdict in lines_of(case):
                 print(" | ".join(row), "|", verdict, flush=True)
-                table.append("   * - " + "\n     - ".join(row))
+            kept.write_text(json.dumps(cases, indent=1, default=float))
+    judged = [case for name, case in cases.items() if name.split(" ")[0] not in CHOSEN_ON and "(" not in name]
+    header = ["method", "followed", "lateral [nm]", "depth [nm]", "lateral over cap", "depth over cap",
+              "width and thickness", "density", "wrong side", "coverage"]  # fmt: skip
+    table = [".. list-table::\n   :header-rows: 1\n"]
+    table += ["   * - " + "\n     - ".join(row) for row in (header, *summary(judged))]
     (options.output / "table.rst").write_text("\n".join(table) + "\n")
-    draw(
-        [path for path in paths if path.stem.startswith(("sphere_low_r", "layer_high_r", "layer40_high"))],
-        options.output,
-    )
+    if not options.only:
+        chosen = [path for path in paths if path.stem.startswith(("sphere_low-r", "layer_high-r", "layer40_high"))]
+        draw(chosen, options.output)
 
 
 if __name__ == "__main__":

@@ -800,7 +800,7 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"Measurement", "constants_of", "settings_of"}  # in tests/fit
     taken |= {"PointCloud", "CompositionField", "TriangleMesh", "ConvexHull", "label_clusters"}  # in tests/measures
     taken |= {"compare_with_truth", "corrected", "truth_comparison"}  # in tests/reconstruction
-    taken |= {"assumptions", "local_scatter", "position_covariances"}
+    taken |= {"assumptions", "local_scatter", "position_covariances", "check_specimen", "phase_sizes"}
     taken |= {"dissociation_line", "load_dataset"}  # in test_correlation, test_dataset
     taken |= {"choose_separation", "nearest_neighbours", "radial_distribution", "short_range_order"}
     taken |= {"interfacial_excess", "ladder_diagram", "read_mesh", "clusters", "composition_profile"}  # and tests/io

@@ -94,6 +94,7 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
         ("--distance 90 --element Ni --efficiency 57", "efficiency must be a finite number > 0 and <= 1, got 57.0"),
         ("--distance 90 --element Ni --smoothing 1.5", "--smoothing: must be an integer >= 1, got '1.5'"),
         ("--distance 90 --element Ni --shank-angle 45", "shank_angle must be a finite number [degrees] >= 0"),
+        ("--distance 90 --element Ni --check", "--check needs --shape evolving and --element, got --shape cap"),
     ],
 )
 def test_wrong_options_are_one_sentence(measured, capsys, tmp_path, options, sentence):
