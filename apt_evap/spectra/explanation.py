@@ -85,6 +85,7 @@ class Explainer:
         self.allowed = self._free if only else None
         self.calibration = MassCalibration()
         self._anchors: list[Point] = []
+        self._pairs: set[str] = set()  # elements whose line may be of a pair of others
         self._alone: set[str] = set()  # elements of lines that no other ion can have
 
     def explain(self) -> Explanation:
@@ -233,7 +234,7 @@ class Explainer:
             if name == "D":  # lines that hydrogen may have say nothing
                 tried = choice.candidates(chosen, amplitudes)
                 held -= set(fit.main[tried[choice.atoms[tried, at] == 0]].tolist())
-            if element_of(name) in (*GASES, "D") and len(held) > 1:
+            if element_of(name) in (*GASES, "D") and len(held) > (name != "D"):
                 continue
             place, ions = largest.get(name, (math.nan, 0.0))
             if ions > 0 and len(held) >= _LINES and contents.ions[sorted(held)].sum() > _MOSTLY * contents.ions.sum():
@@ -241,11 +242,24 @@ class Explainer:
             part = ions / max(float(contents.ions.sum()), 1.0)
             alone = self.abundances.lines(name)[1].max() > _ONE_ISOTOPE  # else the other isotopes should be seen
             if ions > 0 and alone and part >= _ONE_LINE and self.calibration.shift(place)[1][0] <= _KNOWN:
-                continue
+                if not self._pair_fits(choice, chosen, amplitudes, at):
+                    continue
+                self._pairs.add(name)
             if ions > 0 and part >= _ONE_LINE_ALONE and self._only(choice, chosen, amplitudes, name):
                 continue
             unsure[name] = place, ions
         return unsure
+
+    def _pair_fits(self, choice, chosen, amplitudes, at):
+        """Whether one or two atoms of the other elements that are present fit the line of an element about as well."""
+        own = [n for n in chosen if choice.atoms[n, at]]
+        if len(own) != 1:
+            return False
+        absent = ~(choice.atoms[[n for n in chosen if n != own[0]]] > 0).any(0)
+        tried = choice.candidates(chosen, amplitudes)
+        tried = tried[(choice.atoms[tried].sum(1) <= 2) & ~(choice.atoms[tried][:, absent] > 0).any(1)]
+        limit = choice.value(chosen) + _ALIKE
+        return any(total < limit for total, *_ in choice.replacements(chosen, own[0], tried, limit))
 
     def _with_lone(self, choice, chosen, amplitudes):
         """Atomic ions of peaks without a name that no other ion can have."""
@@ -406,7 +420,7 @@ class Explainer:
         """Ions with small shifts of their own, contents with the places of these ions only, errors, alternatives."""
         ions = [choice.fit.ions[number] for number in chosen if choice.fit.ions[number] is not None]
         contents = choice.fit.contents
-        banned, banned_ions = choice.banned - {"D"}, choice.banned_ions  # to be named beside hydrogen
+        banned, banned_ions = choice.banned - {"D", *self._pairs}, choice.banned_ions  # to be named beside other ions
         choice = self._choice(contents, _WINDOWS[-1], own_shift=_OWN_SHIFT)
         choice.banned, choice.banned_ions = banned, banned_ions
         chosen = self._with_shifted(choice, choice.numbers(ions).tolist())
