@@ -50,6 +50,7 @@ _TAB = """
 places.forEach((place, k) => { place.visible = k == choice.active })
 setTimeout(() => Bokeh.index.find_one(places[choice.active])?.el.scrollIntoView({block: "nearest"}), 200)
 """
+_FIRST_ESTIMATE = 0.05  # of a search: the start of its process counts as if it were slow before
 _COPY = """
 navigator.clipboard.writeText(text.text)
 button.label = "copied"
@@ -187,7 +188,7 @@ class Tabs:
 
 def progress_text(part: float, seconds: float, doing: str) -> str:
     """HTML of a bar that fills, with what goes on and the time left by its own rate after some seconds."""
-    left = "" if part <= 0 or seconds <= 0 else f", about {duration(seconds / part * (1 - part))} left"
+    left = "" if part < _FIRST_ESTIMATE or seconds <= 0 else f", about {duration(seconds / part * (1 - part))} left"
     return f'<progress value="{part:.3g}" max="1" style="width: 120px"></progress> <small>{doing}{left}</small>'
 
 
