@@ -128,44 +128,34 @@ def _simulated(tips, sequence):
 
 
 def _densities(places, rim, intervals):
-    """Smoothed density over its mean in each interval, shape (k, bins, bins), and the variance of its noise."""
+    """Smoothed density over its mean in each interval, shape (k, bins, bins)."""
     edges = np.linspace(-rim, rim, _BINS + 1)
     centres = (edges[1:] + edges[:-1]) / 2
     inside = centres[:, None] ** 2 + centres**2 < (0.95 * rim) ** 2
     width = _WIDTH / (edges[1] - edges[0])
     seen = scipy.ndimage.gaussian_filter((centres[:, None] ** 2 + centres**2 < rim**2).astype(float), width)
-    maps, noise = [], []
+    maps = []
     for part in np.array_split(places, intervals):
         counts = scipy.ndimage.gaussian_filter(np.histogram2d(*part.T, bins=(edges, edges))[0], width)
         density = np.where(inside, counts / np.maximum(seen, 0.05), np.nan)
-        mean = np.nanmean(density)
-        maps.append(density / mean)
-        noise.append(1 / (4 * math.pi * width**2 * mean))
-    return np.array(maps), np.array(noise)
+        maps.append(density / np.nanmean(density))
+    return np.array(maps)
 
 
-def _compared(measured, found, pure, ions):
+def _compared(seen, with_phases, alone, ions):
     """Explained part, and its error by sectors that are left out."""
-    (seen, _), (with_phases, noise), (alone, of_pure) = measured, found, pure
-    pattern, change, both = alone - 1, with_phases - alone, (noise + of_pure)[:, None, None]
-    of_pure = of_pure[:, None, None]
-    # least squares of m - 1 over p - 1 and f - p, without the noise of p and f in the products
-    products = (
-        pattern**2 - of_pure, pattern * change + of_pure, change**2 - both, (seen - 1) * pattern, (seen - 1) * change,
-    )  # fmt: skip
+    pattern, change = alone - 1, with_phases - alone
+    # least squares of m - 1 over p - 1 and f - p
+    products = pattern**2, pattern * change, change**2, (seen - 1) * pattern, (seen - 1) * change
     middle = np.arange(_BINS) - (_BINS - 1) / 2
     sector = ((np.arctan2(middle[:, None], middle) / (2 * math.pi)) % 1.0 * _SECTORS).astype(int) % _SECTORS
     sums = np.array([[np.nansum(part[:, sector == k]) for part in products] for k in range(_SECTORS)])
 
     def explained(total):
-        if total[0] < np.nansum(np.where(np.isnan(pattern), np.nan, of_pure)):  # no pattern beyond the noise
-            return float(total[4] / total[2])
         matrix = np.array([[total[0], total[1]], [total[1], total[2]]])
-        return float(np.linalg.solve(matrix, total[3:])[1])
+        return float(np.linalg.lstsq(matrix, total[3:], rcond=1e-6)[0][1])
 
     whole = sums.sum(axis=0)
-    if whole[2] < 0.5 * np.nansum(np.where(np.isnan(change), np.nan, both)):  # the phases change nothing beyond it
-        return SpecimenCheck(seen, with_phases, alone, 0.0, math.inf, ions)
     left = np.array([explained(whole - one) for one in sums])
     error = math.sqrt(((left - left.mean()) ** 2).sum() * (_SECTORS - 1) / _SECTORS)
     return SpecimenCheck(seen, with_phases, alone, explained(whole), error, ions)
