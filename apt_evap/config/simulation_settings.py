@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import sha256_of
@@ -25,6 +26,7 @@ from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.real_units import OperatingPoint, check_flight_charges
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
+from apt_evap.specimen.materials import Material
 from apt_evap.specimen.tip import Tip
 
 _KINDS = {
@@ -240,6 +242,6 @@ class Config:
             return run.at_evaporation_field(self.microscope, self.real_units)
 
 
-def host_of(tip):
+def host_of(tip: Mapping[str, Any]) -> Material:
     """Material, or that of the matrix."""
     return tip["phases"][0].material if "phases" in tip else tip["material"]

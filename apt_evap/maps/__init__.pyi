@@ -2,8 +2,8 @@
 from .crystallography.directions import poles as poles
 from .crystallography.directions import zones as zones
 from .crystallography.orientation import fit_orientation as fit_orientation
-from .density_gains import density_gains as density_gains
 from .folded_map import folded as folded
+from .gains import density_gains as density_gains
 from .indexing.master_pattern import master_patterns as master_patterns
 from .pole_profiles import pole_line_profile as pole_line_profile
 from .pole_profiles import pole_profile as pole_profile

@@ -1,5 +1,6 @@
 """The process of a search: its results, its errors, and its end, of which the page is told."""
 
+import importlib
 import multiprocessing
 import operator
 import os
@@ -85,10 +86,21 @@ def test_a_process_computes_fails_and_ends():
             process.call(abs, (-1,))
 
 
-def test_a_search_tells_its_progress_and_is_cancelled(measured):
+_TOLD = """
+def told(result, progress):
+    for part in (0.0, 0.5):
+        progress(part)
+    return result
+"""
+
+
+def test_a_search_tells_its_progress_and_is_cancelled(measured, tmp_path, monkeypatch):
+    (tmp_path / "function_of_a_search.py").write_text(_TOLD)
+    monkeypatch.syspath_prepend(tmp_path)  # the process that is started finds it there, too
+    function = importlib.import_module("function_of_a_search").told
     with SearchProcess() as process:
         told = []
-        assert process.call(_told, (3,), {}, told.append) == 3 and told == [0.0, 0.5]
+        assert process.call(function, (3,), {}, told.append) == 3 and told == [0.0, 0.5]
     later = Later()
     panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)
     panel._search(panel.search)
@@ -97,12 +109,6 @@ def test_a_search_tells_its_progress_and_is_cancelled(measured):
     panel._cancel()
     later.settle(lambda: not panel.search.disabled)
     assert "cancelled" in panel.text.text and not panel.cancel.visible
-
-
-def _told(result, progress):
-    for part in (0.0, 0.5):
-        progress(part)
-    return result
 
 
 def test_a_search_whose_process_is_killed_is_over(measured):

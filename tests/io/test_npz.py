@@ -29,7 +29,8 @@ def test_counts_with_a_mask(tmp_path):
     assert map.source.endswith("map.npz")
     assert np.array_equal(ae.read(tmp_path / "map.npz").counts, COUNTS)
     suffixes = (
-        r"must be one of \.h5, \.nxs, \.epos, \.pos, \.apt, \.raw, \.npz, \.csv, \.txt, \.tapsim, got suffix '\.py'$"
+        r"must be one of \.h5, \.nxs, \.epos, \.pos, \.apt, \.raw, \.ato, \.npz, \.csv, \.txt, \.tapsim, "
+        r"got suffix '\.py'$"
     )
     with pytest.raises(ae.FileError, match=suffixes):
         ae.read(Path(__file__))

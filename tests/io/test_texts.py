@@ -49,7 +49,7 @@ def test_compressed_ranges_and_tables(tmp_path, suffix, compress):
 
 
 @pytest.mark.parametrize(
-    ("name", "advice"), [("a.ato", "convert it to .epos"), ("a.rhit", "from AP Suite"), ("a.rrng", "--ranges read it")]
+    ("name", "advice"), [("a.ops", "convert it to .epos"), ("a.rhit", "from AP Suite"), ("a.rrng", "--ranges read it")]
 )
 def test_other_files_of_the_field_are_refused_with_advice(tmp_path, name, advice):
     (tmp_path / name).write_bytes(bytes(100))

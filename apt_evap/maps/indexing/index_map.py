@@ -19,8 +19,8 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.crystallography.symmetry import point_group
-from apt_evap.maps.density_gains import Densities, DensityGains, density_gains
 from apt_evap.maps.folded_map import FoldedMap, folded
+from apt_evap.maps.gains import Densities, DensityGains, density_gains
 from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
 from apt_evap.maps.indexing.halves_and_surrogates import second_grain, second_lattice, surrogates_of

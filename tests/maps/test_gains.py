@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.maps.density_gains import DensityGains
+from apt_evap.maps.gains import DensityGains
 from apt_evap.maps.indexing.master_pattern import master_patterns
 
 PROJECTION = ae.detection.Projection(60.0)
