@@ -74,6 +74,24 @@ def test_the_error_is_that_of_new_counts(rng):
     assert np.mean([ring.error for ring in rings]) == pytest.approx(scatter, rel=0.5)  # 25 values: 14 %
 
 
+def test_the_error_is_that_of_resamples_whose_contrast_has_the_noise_twice(rng):
+    """The same with a map for each resample, where the contrast is as small as the noise."""
+    edges = np.linspace(-30, 30, 61)
+    x, y = np.meshgrid(*[(edges[1:] + edges[:-1]) / 2] * 2)
+
+    def ring_of(counts):
+        map = ae.DetectorMap.from_array(counts, edges, edges, is_counts=True)
+        return ae.maps.ring_statistics(map, PLANE, rings=[(6, 15)], fold=3)[0]
+
+    measured = rng.poisson(3 * (1 + 0.12 * np.cos(3 * np.arctan2(y, x))))
+    ring = ring_of(measured)
+    noise = np.var(ring.profile) - ring.contrast**2
+    assert 1 < ring.contrast**2 / noise < 3
+    once = np.array([ring_of(rng.poisson(measured)).contrast for _ in range(200)])
+    scatter = np.std(np.sqrt(np.maximum(once**2 - noise, 0)))
+    assert ring.error == pytest.approx(scatter, rel=0.15)  # 200 resamples twice: 7 %; with the noise once 0.77 of it
+
+
 def test_densities_have_the_noise_of_their_hits(rng):
     """A map of counts in another unit: the same profile to rounding, and the same noise as far as it can be told."""
     map = counted(simulated(rng, 200_000, 0.3))

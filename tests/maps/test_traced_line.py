@@ -48,6 +48,23 @@ def test_the_errors_are_those_of_repeated_measurements(rng):
     assert errors.mean(axis=0) == pytest.approx(found.std(axis=0), rel=0.4)
 
 
+def test_the_errors_do_not_depend_on_the_direction_of_the_ends():
+    counts = map_of(np.round(20 * density(0.0, 0.0, slope=0.0)), is_counts=True)
+
+    def traced(turn):
+        """With ends whose rectangle contains 36 mm of the line, as does that along the line."""
+        cosine, sine = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        x, y = 18 * cosine * cosine, 18 * cosine * sine
+        return ae.maps.trace_line(counts, (-x, -y, x, y), width=24.0)
+
+    along, turned = traced(0.0), traced(25.0)
+    assert turned.direction == pytest.approx(along.direction, abs=0.01)
+    # corners of the rectangles differ; with another power of the cosine of 25 degrees they are 9 % apart
+    assert turned.direction_error == pytest.approx(along.direction_error, rel=0.01)
+    assert turned.place_error == pytest.approx(along.place_error, rel=0.01)
+    assert turned.width == pytest.approx(along.width, rel=0.01)
+
+
 def test_bad_input_gets_a_sentence():
     map = map_of(density(0.0, 0.0))
     with pytest.raises(ValueError, match="ends must be two different points"):
