@@ -10,7 +10,8 @@ plain form for HDF5, TOML and JSON (`to_plain`, `from_plain`), and the Python te
 
         width: float = number("Standard deviation of the top", default=0.5, above=0, unit="ns")
 
-Conditions on several fields are in a method ``_check``. It may return a dict of fields to replace.
+Conditions on several fields are in a method ``_check``. It may return a dict of fields to replace. A frozen dataclass
+that is not one of settings, such as one of arrays, has the same by ``check_itself`` in its ``__post_init__``.
 """
 
 import math
@@ -222,9 +223,14 @@ def is_settings(thing: Any) -> bool:
 def _check_all(self):
     for item, setting in declared(type(self)).items():
         object.__setattr__(self, item, setting.check(getattr(self, item), item))
-    further = getattr(self, "_check", None)
-    for item, better in ((further and further()) or {}).items():
-        object.__setattr__(self, item, better)
+    if hasattr(self, "_check"):
+        check_itself(self)
+
+
+def check_itself(frozen: Any) -> None:
+    """Call the method ``_check`` of a new frozen object, and replace the fields that it returns."""
+    for item, better in (frozen._check() or {}).items():
+        object.__setattr__(frozen, item, better)
 
 
 def _documented(cls):

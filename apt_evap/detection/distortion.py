@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array
 
@@ -61,6 +62,9 @@ class DistortionGrid:
     _fit: _Fit = field(init=False)
 
     def __post_init__(self):
+        check_itself(self)
+
+    def _check(self):
         detector = check_array(self.detector, "detector", ("n", 2))
         grid = check_array(self.grid, "grid", (len(detector), 2))
         name = f"grid {self.source!r}" if self.source else "a grid"
@@ -83,9 +87,7 @@ class DistortionGrid:
                 f"{name} must not be folded: adjacent crossings around ({folded[0]:.3g}, {folded[1]:.3g}) mm on the "
                 "detector are in another order in the plane of the grid"
             )
-        object.__setattr__(self, "detector", detector)
-        object.__setattr__(self, "grid", grid)
-        object.__setattr__(self, "_fit", _Fit(fitted, bool(mirrored), triangles, proper))
+        return {"detector": detector, "grid": grid, "_fit": _Fit(fitted, bool(mirrored), triangles, proper)}
 
     @property
     def residual(self) -> float:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import Booleans, Column, Floats
 from apt_evap._common.validation import (
@@ -138,35 +139,34 @@ class Hits:
     extent: tuple[float, float, float, float] | None = None
 
     def __post_init__(self):
-        lengths = {}
-        for name in _COLUMNS:
-            value = getattr(self, name)
-            if value is not None:
-                column = _column(name, value)
-                object.__setattr__(self, name, column)
-                lengths[name] = len(column)
+        check_itself(self)
+
+    def _check(self):
+        values = {name: _column(name, getattr(self, name)) for name in self.columns}
+        lengths = {name: len(column) for name, column in values.items()}
         for name in ("extra", "units"):
             mapping = {} if getattr(self, name) is None else getattr(self, name)
             check_kind(mapping, name, Mapping, "a mapping by name of the column")
             for key in mapping:
                 check_kind(key, f"a name in {name}", str, "text")
-            object.__setattr__(self, name, dict(mapping))
-        self.extra.update({name: _extra(name, value) for name, value in self.extra.items()})
+            values[name] = dict(mapping)
+        values["extra"] = {name: _extra(name, value) for name, value in values["extra"].items()}
         check_kind(self.source, "source", str, "text")
         if self.ranges is not None:
             check_kind(self.ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
         if self.extent is not None:
             check_array(self.extent, "extent", (4,))
-        lengths.update((name, len(values)) for name, values in self.extra.items())
+        lengths.update((name, len(column)) for name, column in values["extra"].items())
         if not lengths:
             raise ValueError("Hits needs at least one column, got none")
         if len(set(lengths.values())) > 1:
             pairs = ", ".join(f"{name} {length}" for name, length in lengths.items())
             raise ValueError(f"the columns of Hits must have equal lengths, got {pairs}")
-        if self.outcome is not None and len(self):
-            low, high = self.outcome.min(), self.outcome.max()
+        if self.outcome is not None and len(values["outcome"]):
+            low, high = values["outcome"].min(), values["outcome"].max()
             if low < min(Outcome) or high > max(Outcome):
                 raise ValueError(f"outcome must be Outcomes, {min(Outcome)} to {max(Outcome)}, got {low} to {high}")
+        return values
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_number
@@ -59,9 +60,12 @@ class Emissions:
     targets: Any = None
     charge_ratios: Any = None
     rollup_distances: np.ndarray | None = None
-    _kept: Any = field(default=None, init=False)  # key and result of the last call of `kept`
+    _kept: dict = field(default_factory=dict, init=False)  # key and result of the last call of `kept`
 
     def __post_init__(self):
+        check_itself(self)
+
+    def _check(self):
         positions = check_array(self.positions, "positions", ("n", 3))
         n = len(positions)
         distance = check_number(self.nearest_neighbour_distance, "nearest_neighbour_distance", above=0, unit="nm")
@@ -91,8 +95,7 @@ class Emissions:
         ):
             if n and name in values and values[name].min() < least:
                 raise ValueError(f"{name} must be > 0, got {values[name].min()}")
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        return values
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -128,9 +131,12 @@ class Emissions:
         compute : callable
             Returns the result.
         """
-        if self._kept is None or self._kept[0] != key:
-            object.__setattr__(self, "_kept", (key, compute()))
-        return self._kept[1]
+        if key in self._kept:
+            return self._kept[key]
+        result = compute()
+        self._kept.clear()
+        self._kept[key] = result
+        return result
 
     @property
     def slowness(self) -> Floats:
@@ -214,11 +220,16 @@ class Launches:
     rolled: np.ndarray
 
     def __post_init__(self):
+        check_itself(self)
+
+    def _check(self):
         positions = check_array(self.positions, "positions", ("n", 3))
         n = len(positions)
-        object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "velocities", check_array(self.velocities, "velocities", (n, 3)))
-        object.__setattr__(self, "rolled", check_array(self.rolled, "rolled", (n,), dtype=bool))
+        return {
+            "positions": positions,
+            "velocities": check_array(self.velocities, "velocities", (n, 3)),
+            "rolled": check_array(self.rolled, "rolled", (n,), dtype=bool),
+        }
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.validation import check_count, check_number, check_sequence
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector_map import DetectorMap
@@ -39,13 +40,17 @@ class ExplorerSettings:
     ions: tuple[int, int] | None = None
 
     def __post_init__(self):
+        check_itself(self)
+
+    def _check(self):
         check_count(self.bins, "bins", at_least=1, at_most=MAX_BINS)
-        for name in ("smoothing", "flattening"):
-            object.__setattr__(self, name, check_number(getattr(self, name), name, at_least=0, unit="mm"))
-        if self.ions is not None:
-            first, last = check_sequence(self.ions, "ions", "(first, last)")
-            first = check_count(first, "first ion")
-            object.__setattr__(self, "ions", (first, check_count(last, "last ion", at_least=first + 1)))
+        widths = ("smoothing", "flattening")
+        values = {name: check_number(getattr(self, name), name, at_least=0, unit="mm") for name in widths}
+        if self.ions is None:
+            return values
+        first, last = check_sequence(self.ions, "ions", "(first, last)")
+        first = check_count(first, "first ion")
+        return values | {"ions": (first, check_count(last, "last ion", at_least=first + 1))}
 
 
 @dataclass(frozen=True, eq=False)

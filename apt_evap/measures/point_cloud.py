@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apt_evap._common.codec import for_json
+from apt_evap._common.codec import check_itself, for_json
 from apt_evap._common.types import Booleans, Estimated, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.measures.clusters import (
@@ -70,8 +70,11 @@ class PointCloud:
     source: str = ""
 
     def __post_init__(self):
-        object.__setattr__(self, "positions", check_array(self.positions, "positions", ("n", 3)))
-        n = len(self.positions)
+        check_itself(self)
+
+    def _check(self):
+        positions = check_array(self.positions, "positions", ("n", 3))
+        n = len(positions)
         names = tuple(check_sequence(self.names, "names", "names of species"))
         species = check_array(self.species, "species", (n,), dtype=np.int64)
         if n and not (species.min() >= -1 and species.max() < len(names)):
@@ -79,8 +82,8 @@ class PointCloud:
         composition = [{name: 1} for name in names] if self.composition is None else self.composition
         if len(composition) != len(names):
             raise ValueError(f"composition must have one entry for each of {len(names)} names, got {len(composition)}")
-        for name, value in (("names", names), ("species", species), ("composition", tuple(map(dict, composition)))):
-            object.__setattr__(self, name, value)
+        composition = tuple(map(dict, composition))
+        return {"positions": positions, "names": names, "species": species, "composition": composition}
 
     def __len__(self) -> int:
         return len(self.positions)

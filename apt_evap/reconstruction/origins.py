@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.files import FileError, open_for_reading, replace_file
 from apt_evap._common.types import AnyPath, Floats
 from apt_evap._common.validation import (
@@ -63,14 +64,16 @@ class OriginTable:
     symmetry: int = 1
 
     def __post_init__(self):
-        for name in ("places", "shifts"):
-            object.__setattr__(self, name, check_array(getattr(self, name), name, ("n", 2)))
-        if len(self.places) != len(self.shifts):
-            raise ValueError(f"places and shifts must have equal lengths, got {len(self.places)}, {len(self.shifts)}")
-        object.__setattr__(self, "neighbours", check_count(self.neighbours, "neighbours", at_least=3))
-        if len(self.places) < self.neighbours:
-            raise ValueError(f"a table needs at least {self.neighbours} ions, got {len(self.places)}")
-        object.__setattr__(self, "_tree", scipy.spatial.cKDTree(self.places))
+        check_itself(self)
+
+    def _check(self):
+        places, shifts = (check_array(getattr(self, name), name, ("n", 2)) for name in ("places", "shifts"))
+        if len(places) != len(shifts):
+            raise ValueError(f"places and shifts must have equal lengths, got {len(places)}, {len(shifts)}")
+        neighbours = check_count(self.neighbours, "neighbours", at_least=3)
+        if len(places) < neighbours:
+            raise ValueError(f"a table needs at least {neighbours} ions, got {len(places)}")
+        return {"places": places, "shifts": shifts, "neighbours": neighbours, "_tree": scipy.spatial.cKDTree(places)}
 
     def __len__(self) -> int:
         return len(self.places)

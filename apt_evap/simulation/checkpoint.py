@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from apt_evap._common.codec import check_itself
 from apt_evap._common.files import FileError, check_path, check_regular, remove_abandoned
 from apt_evap._common.interrupts import uninterrupted
 from apt_evap._common.locks import FileLock
@@ -55,14 +56,18 @@ class Checkpoint:
     overwrite: bool = False
 
     def __post_init__(self):
-        object.__setattr__(self, "path", check_path(self.path))
-        if self.path.suffix.lower() != ".h5":
-            raise FileError(f"a run is saved in an HDF5 file whose name ends in .h5, got {str(self.path)!r}")
+        check_itself(self)
+
+    def _check(self):
+        path = check_path(self.path)
+        if path.suffix.lower() != ".h5":
+            raise FileError(f"a run is saved in an HDF5 file whose name ends in .h5, got {str(path)!r}")
         check_number(self.minutes, "minutes", at_least=0, unit="min")
         if self.ions is not None:
             check_count(self.ions, "ions", at_least=1)
         for name in ("resume", "overwrite"):
             check_switch(getattr(self, name), name)
+        return {"path": path}
 
     @property
     def unfinished(self) -> Path:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.codec import from_plain
+from apt_evap._common.codec import check_itself, from_plain
 from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import Booleans, Floats
@@ -54,10 +54,11 @@ class RunTable:
     real: RealColumns | None = None
 
     def __post_init__(self):
-        if self.detached is None:
-            object.__setattr__(self, "detached", np.zeros(len(self.site), bool))
-        if self.phase is None:
-            object.__setattr__(self, "phase", np.zeros(len(self.site), np.int8))
+        check_itself(self)
+
+    def _check(self):
+        of_all = {"detached": bool, "phase": np.int8}
+        return {name: np.zeros(len(self.site), kind) for name, kind in of_all.items() if getattr(self, name) is None}
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields alone, for copies: what was computed from them is computed again."""
