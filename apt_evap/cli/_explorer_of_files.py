@@ -78,7 +78,7 @@ def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, Exp
     if options.element is not None and (name := read_material(options.element, "--element").name) in MATERIALS:
         explorer.crystal = name
     if explorer.is_comparison:
-        explorer.registration_options = _place(options.run, explorer.measured)
+        explorer.search.options = _place(options.run, explorer.measured)
     start = explorer.start
     bins = options.bins or start.bins
     view = ExplorerSettings(

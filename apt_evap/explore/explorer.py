@@ -4,38 +4,26 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from apt_evap._common.validation import check_array, check_count, check_kind, check_number
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.binning import bins_for, field_of_view
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.projection import Projection
 from apt_evap.emission.perturbations import Perturbation, RollUp, TruncatedNormal, Unperturbed
 from apt_evap.explore.controls import MECHANISMS, Control, controls_of, perturbation_of
 from apt_evap.explore.explorer_maps import ExplorerMaps, ExplorerSettings
 from apt_evap.explore.explorer_text import Commands, ExplorerText
-from apt_evap.explore.marks import Overlay, overlay
 from apt_evap.explore.measured_ions import MeasuredIons
-from apt_evap.explore.placement import misplaced
-from apt_evap.fit.confirmation import confirmed
-from apt_evap.fit.indexed_registration import index_as_run, indexed_start, register_near
+from apt_evap.explore.poles_of_run import PolesOfRun
+from apt_evap.explore.registration_search import RegistrationSearch
 from apt_evap.fit.measured_map import BINS, measured_map
-from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
 from apt_evap.io.measured_file import MeasuredFile
-from apt_evap.maps.crystallography.directions import poles
-from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import pole_symmetry
 from apt_evap.maps.profiles import Profile, Rectangle, zone_line_profile
-from apt_evap.maps.registration.register import Registration, register
-from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
-from apt_evap.maps.rings import Ring, ring_statistics
+from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.similarity import WINDOW, similarity, similarity_ceiling, window_fits
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import AptWarning
@@ -45,19 +33,6 @@ PREVIEW = 50_000
 REGION = RollUp(TruncatedNormal(0.155, 0.155))
 """Second perturbation, beside none, whose map limits the common region: energies of Shaikh et al. (2025) for nickel."""
 _PERTURBATIONS = 2  # whose positions are kept: one may be that of a preview
-_FAMILIES = 6  # of poles over the maps
-_NEAR = 15.0  # degrees: a pole farther from the axis of the specimen is not that of its apex
-
-
-class Pole(NamedTuple):
-    """Pole near the axis of a specimen."""
-
-    label: str
-    """Indices in the math syntax of matplotlib; "axis" for a specimen without a crystal."""
-    place: tuple[float, float]
-    """Position on the map [mm]."""
-    fold: int
-    """Rotational symmetry of the poles about it."""
 
 
 class Explorer:
@@ -128,9 +103,8 @@ class Explorer:
         """Name of the crystal of the measurement, if it is known and one of the table."""
         self.crystal_of_ions = ""
         """Element of most of the measured ions by their masses, if the spectrum has named them."""
-        self.registration_options: dict[str, Any] = {}
-        """Options of `register` that say where the run is on the measurement."""
-        self._indexed_start: dict[str, Any] | None = None  # the same by an indexing of these ions; {} if undecided
+        self.poles: Any = None if run is None else PolesOfRun(run)
+        self.search: Any = None if run is None else RegistrationSearch(run)
         if run is not None and measured is not None and registration is None:
             self.registration = self._same_size()
 
@@ -148,7 +122,8 @@ class Explorer:
         """Take the ions that are now selected of the file."""
         if isinstance(self.ions_of_file, MeasuredIons):
             self.measured = self.ions_of_file.hits
-            self._indexed_start = None
+            if self.search is not None:
+                self.search.forget_ions()
             self._kept_maps, self._kept_picture = {}, (None, None)
 
     def keep_ions(self, other: "Explorer") -> None:
@@ -227,81 +202,22 @@ class Explorer:
         progress: Callable[[float, int], None] | None = None,
         apply: Callable[..., Registration] | None = None,
     ) -> Registration:
-        """Register the run on the measurement: the best of several emissions. Returns `registration`.
+        """Set the registration at each emission that is better than those before, see `RegistrationSearch.best`.
 
-        It is set at each emission that is better than those before and not doubtful, and at the end.
-
-        Parameters
-        ----------
-        perturbations : sequence of perturbation, optional
-            Emissions to try; by default one of each mechanism.
-        progress : callable, optional
-            Called at the start and after each emission, with the number of those that are done, and of all. The
-            indexing of the measured map is the first of them if it is not known yet, and is told in parts. An error
-            that it raises ends the search.
-        apply : callable, optional
-            Calls a function with a tuple of arguments, such as `SearchProcess.call`.
-
-        Returns
-        -------
-        Registration
-
-        Raises
-        ------
-        ValueError
-            If there is no run or no measurement, or as in `register`.
-
-        Warns
-        -----
-        RegistrationWarning
-            If the best registration is doubtful.
+        By default one emission of each mechanism is tried. The best one is returned; it may be doubtful, with a
+        warning.
         """
-        if self.run is None or self.measured is None:
+        if not self.is_comparison:
             raise ValueError("a registration needs a run, and measured ions or a measured map, got only one of them")
-        target = measured_map(self.measured)
-        if perturbations is None and not self.has_sliders:
-            perturbations = self._emissions
-        if perturbations is None:
+        if perturbations is None and self.has_sliders:
             perturbations = [perturbation_of(name, _starting_values(name)) for name in MECHANISMS]
-        call = apply or (lambda function, arguments, options={}, progress=None: function(*arguments, **options))
-        best: Registration | None = None
-        registration: Registration | None
-        failed = ValueError("perturbations must contain at least one perturbation, got none")
-        progress = progress or (lambda done, number: None)
-        indexes = not self.registration_options and self._indexed_start is None
-        number = len(perturbations) + indexes
-        progress(0, number)
-        options = self._start(target, call, lambda part: progress(part, number))
-        for done, perturbation in enumerate(perturbations, 1 + indexes):
-            arguments = self.run.hits(perturbation), target, options
-            try:
-                registration = call(_registration, arguments)
-            except ValueError as error:  # such as a map that is too empty with this emission
-                registration, failed = None, error
-            progress(done, number)
-            if registration is not None and (best is None or registration.score > best.score):
-                best = registration
-                if not best.doubtful:
-                    self.set_registration(best)
-        if best is None:
-            raise failed
+        elif perturbations is None:
+            perturbations = self._emissions
+        target = measured_map(self.measured)
+        best = self.search.best(target, self.distance, perturbations, self.set_registration, progress, apply)
         self.set_registration(best)
         best.warn_if_doubtful()
         return best
-
-    def _start(self, target, call, progress):
-        """Options that say where the run is: given ones, or by an indexing of the measured map, once for its ions."""
-        if self.registration_options:
-            return self.registration_options
-        if (start := self._indexed_start) is None:
-            start = {}
-            arguments = target, Orientation.known(self.run.settings["tip"]), self.distance
-            indexing = call(index_as_run, arguments, {}, progress)
-            if indexing is not None and indexing.decided:
-                with suppress(ValueError):  # the axis of the run is not on the map
-                    start = indexed_start(self.run, indexing)
-            self._indexed_start = start
-        return start
 
     def set_registration(self, registration: Registration) -> None:
         """Set the transform into the measured frame."""
@@ -310,23 +226,9 @@ class Explorer:
         self._kept_places, self._kept_maps = [], {}
 
     def show(self, settings: ExplorerSettings, preview: bool = False) -> ExplorerMaps:
-        """Compute maps.
+        """Compute maps; ValueError if no ion is on the map.
 
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Emission, bins, smoothing and ions.
-        preview : bool
-            Whether to use evenly spaced ions, at most the number of a preview. Their noise lowers the similarity.
-
-        Returns
-        -------
-        ExplorerMaps
-
-        Raises
-        ------
-        ValueError
-            If no ion is on the map.
+        A preview has evenly spaced ions, at most the number of a preview. Their noise lowers the similarity.
         """
         start = time.perf_counter()
         with warnings.catch_warnings(record=True) as caught:
@@ -360,20 +262,7 @@ class Explorer:
         )
 
     def hits(self, settings: ExplorerSettings, preview: bool = False) -> Hits:
-        """Simulated ions of the maps, in the measured frame if there is a measurement.
-
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Settings of the maps.
-        preview : bool
-            As for `show`.
-
-        Returns
-        -------
-        Hits
-            With x, y, ion and outcome.
-        """
+        """Simulated ions of the maps, in the measured frame if there is a measurement; with x, y, ion and outcome."""
         run: Any = self._preview_run if preview else self.run
         registration = self.registration  # may be set by another thread
         key = settings.perturbation, run is self.run, registration
@@ -387,23 +276,10 @@ class Explorer:
         return places if settings.ions is None else places[slice(*np.searchsorted(run.emissions.ions, settings.ions))]
 
     def bins_like(self, bins: int) -> DetectorMap:
-        """Map whose bins and mask all maps with this number of bins have.
+        """Map whose bins and mask all maps have, with about this number of bins along the longer side.
 
-        Parameters
-        ----------
-        bins : int
-            Number of bins along the longer side; approximate with a measurement.
-
-        Returns
-        -------
-        DetectorMap
-            The measured map, with a run within the region that the simulated maps cover; without a measurement the
-            unperturbed map of the run.
-
-        Raises
-        ------
-        ValueError
-            If no bin remains.
+        It is the measured map, with a run within the region that the simulated maps cover, and without a measurement
+        the unperturbed map of the run. ValueError if no bin remains.
         """
         key = bins, self.registration
         if key not in self._kept_maps:
@@ -457,164 +333,19 @@ class Explorer:
 
     # ---- what is on a map ------------------------------------------------------------------------------------------
 
-    @cached_property
-    def _projection(self):
-        """Projection from the specimen onto the detector."""
-        return image_compression(self.run).projection
-
-    @cached_property
-    def _pole(self):
-        """Label, direction in the specimen and symmetry of the pole nearest to the axis."""
-        orientation = Orientation.known(self.run.settings["tip"])
-        if orientation is not None:
-            family = poles(orientation.material)
-            directions = orientation.directions(family.normals)
-            nearest = int(directions[:, 2].argmax())
-            if directions[nearest, 2] > math.cos(math.radians(_NEAR)):
-                fold = pole_symmetry(orientation.material, family.normals[nearest]).order
-                return family.labels[nearest], directions[nearest], fold
-        return "axis", np.array([0.0, 0.0, 1.0]), 1
-
-    @property
-    def pole(self) -> Pole:
-        """The pole nearest to the axis of the specimen, or the axis if there is none within 15 degrees.
-
-        Raises
-        ------
-        ValueError
-            If the run has too few ions for its image compression.
-        """
-        text, direction, fold = self._pole
-        x, y = self._projection.places(direction[None])[0]
-        if self.registration is not None:
-            x, y = self.registration.points(x, y)
-        return Pole(text, (float(x), float(y)), fold)
-
-    def poles_over(self, maps: ExplorerMaps) -> Overlay | None:
-        """Poles and zone lines of the specimen on the maps, None without a crystal or with too few ions."""
-        orientation = Orientation.known(self.run.settings["tip"])
-        if orientation is None:
-            return None
-        try:
-            projection = self._projection
-        except ValueError:  # too few ions
-            return None
-        if self.registration is not None:
-            projection = RegisteredProjection(projection, self.registration)
-        like = maps.pictures[-1] if maps.whole is None else maps.whole
-        drawn = overlay(orientation, projection, like, _FAMILIES)
-        inside = np.flatnonzero(like.contains(*drawn.places.T))
-        return drawn._replace(places=drawn.places[inside], labels=tuple(drawn.labels[k] for k in inside))
-
-    def rings(self, maps: ExplorerMaps) -> tuple[tuple[Ring, ...], ...]:
-        """Statistics of rings about the pole, of the simulated and of the measured map.
-
-        Parameters
-        ----------
-        maps : ExplorerMaps
-            Maps, neither flattened nor smoothed for this.
-
-        Returns
-        -------
-        tuple of tuple of Ring
-            For each map the default rings of `ring_statistics`.
-
-        Raises
-        ------
-        ValueError
-            If a ring is outside the map or has too few ions.
-
-        Notes
-        -----
-        Both maps have the same projection, that of the run, centred on the pole and scaled by the registration.
-        """
-        pole = self.pole
-        scale = 1.0 if self.registration is None else self.registration.scale
-        projection = Projection(self._projection.scale * scale, pole.place, compression=self._projection.compression)
-        return tuple(ring_statistics(counts, projection, fold=pole.fold) for counts in _present(maps))
-
-    def likeness(self, maps: ExplorerMaps) -> Likeness:
-        """Whether both maps show the same crystal along the same axis, as `Study.likeness`, and lie on each other."""
-        assert maps.simulated is not None and maps.measured is not None and self.registration is not None
-        arguments = maps.simulated, maps.measured, self.registration
-        try:
-            projection = self._projection
-        except ValueError:  # too few ions
-            projection = None
-        orientation = Orientation.known(self.run.settings["tip"])
-        result = likeness(*arguments, about=symmetric_places(orientation, projection))
-        if result.verdict == "alike":
-            result = confirmed(result, *self._structures(maps))
-        if result.verdict == "alike" and (why := misplaced(*arguments)):
-            return result._replace(verdict="doubtful", reason=f"{result.reason}, but {why}: check the registration")
-        return result
-
-    def _structures(self, maps):
-        """Structure of both maps about a pole, None without one whose rings are on the maps."""
-        measure, measured = self._measured_structure(maps)
-        if measure is None:
-            return None, None
-        return measure.structure(maps.simulated), measured
-
-    def _measured_structure(self, maps):
-        """Measure of a pole, and the structure of the measured map, kept for all emissions; None without a pole."""
-        key = "structure", maps.settings.bins, self.registration
-        if key not in self._kept_maps:
-            try:
-                measure = PoleMeasure(self.run, self.registration, maps.measured)
-            except ValueError:
-                self._kept_maps[key] = None, None
-            else:
-                self._kept_maps[key] = measure, measure.structure(maps.measured)
-        return self._kept_maps[key]
-
     def profiles(self, maps: ExplorerMaps, ends: Any, width: float) -> tuple[Rectangle, tuple[Profile, ...]]:
-        """Profiles across a line on the maps.
-
-        Parameters
-        ----------
-        maps : ExplorerMaps
-            The maps; counts and densities as they are, not smoothed.
-        ends : array_like
-            Ends of the line [mm], shape (2, 2).
-        width : float
-            Width of the profile across the line [mm].
-
-        Returns
-        -------
-        rectangle : Rectangle
-            Region along the line.
-        profiles : tuple of Profile
-            `zone_line_profile` of the simulated and of the measured map, as far as there are both.
-
-        Raises
-        ------
-        ValueError
-            If the line has no length, or a map has no hits along it.
-        """
+        """Region along a line with ends of shape (2, 2) [mm], and the profile of each map across this width [mm]."""
         (x0, y0), (x1, y1) = check_array(ends, "ends", (2, 2)).tolist()
         length = math.hypot(x1 - x0, y1 - y0)
         rectangle = Rectangle(((x0 + x1) / 2, (y0 + y1) / 2), math.degrees(math.atan2(y1 - y0, x1 - x0)), length, width)
         bins = max(2, int(width / maps.bin_size))
-        return rectangle, tuple(zone_line_profile(counts, rectangle, bins=bins) for counts in _present(maps))
+        return rectangle, tuple(zone_line_profile(counts, rectangle, bins=bins) for counts in maps.present)
 
     def atoms_at(self, settings: ExplorerSettings, x: float, y: float, radius: float) -> Hits:
-        """Atoms of the specimen whose ions land within a circle on the map.
+        """Atoms of the specimen whose ions land within a circle on the map [mm].
 
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Emission and ions.
-        x, y : float
-            Centre of the circle [mm].
-        radius : float
-            Radius of the circle [mm].
-
-        Returns
-        -------
-        Hits
-            Places on the map, `positions` in the specimen [nm], `site`, `ion`, and in `extra` the charge [e] and
-            field [V/nm] at the simulated voltage.
+        They have their places on the map, `positions` in the specimen [nm], `site`, `ion`, and in `extra` the charge
+        [e] and field [V/nm] at the simulated voltage.
         """
         hits = self.hits(settings)
         centre = check_array((x, y), "x and y", (2,))
@@ -662,18 +393,6 @@ class Explorer:
         if isinstance(self.ions_of_file, MeasuredIons):
             return self.ions_of_file.code
         return "measured" if self._map_file is None else self._map_file.code(())
-
-
-def _registration(simulated, measured, options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", AptWarning)  # given once, for the best one
-        if "start" in options:
-            return register_near(simulated, measured, options)
-        return register(simulated, measured, **options)
-
-
-def _present(maps):
-    return [counts for counts in (maps.simulated, maps.measured) if counts is not None]
 
 
 def _has_window(like):

@@ -96,6 +96,11 @@ class ExplorerMaps:
     notes: tuple[str, ...]
 
     @property
+    def present(self) -> list[DetectorMap]:
+        """The simulated and the measured map, as far as there are both."""
+        return [counts for counts in (self.simulated, self.measured) if counts is not None]
+
+    @property
     def width(self) -> float:
         """Longer side of the maps [mm]."""
         left, right, lower, upper = self.pictures[0].extent

@@ -38,7 +38,7 @@ class PolePanel:
 
     def _put(self):
         self._drawn = self._explorer.registration
-        drawn = self._explorer.poles_over(self._maps) if self.button.active else None
+        drawn = self._explorer.poles.overlay(self._maps, self._drawn) if self.button.active else None
         if drawn is None or (self._explorer.is_comparison and not self._explorer.registered):
             self.lines.data, self.poles.data = {"x": [], "y": []}, {"x": [], "y": [], "label": []}
             return

@@ -140,7 +140,8 @@ class RegistrationPanel:
 
     def compare(self, maps: ExplorerMaps) -> None:
         """Compute the verdict in any thread; it is shown if the maps are still these, and no search goes on."""
-        self._later(partial(self._put_likeness, maps, self._explorer.likeness(maps)), 0)
+        likeness = self._explorer.poles.likeness(maps, self._explorer.registration)
+        self._later(partial(self._put_likeness, maps, likeness), 0)
 
     def _put_likeness(self, maps, likeness):
         if maps is self._maps and self._progress is None:  # the first emission of a search seldom fits

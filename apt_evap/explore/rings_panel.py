@@ -28,7 +28,7 @@ class RingsPanel:
     def measure(self, maps: ExplorerMaps) -> None:
         """Compute the rings in any thread; they are shown if the maps are still these."""
         try:
-            text = self._table(self._explorer.rings(maps))
+            text = self._table(self._explorer.poles.rings(maps, self._explorer.registration))
         except ValueError as error:
             text = escape(f"not here: {str(error).split(' on <')[0]}")
         self._later(partial(self._put_text, maps, text), 0)
@@ -47,6 +47,6 @@ class RingsPanel:
                 cells.append(f"<td>{ring.contrast:.2f}{error}<br>{ring.minimum:.2f} to {ring.maximum:.2f}</td>")
             lines.append(f"<tr><td>{name}</td>{''.join(cells)}</tr>")
         return (
-            f"rings about {plain(self._explorer.pole.label)}: contrast, lowest and highest density"
+            f"rings about {plain(self._explorer.poles.nearest[0])}: contrast, lowest and highest density"
             f'<table cellpadding="3"><tr><td></td>{head}</tr>{"".join(lines)}</table>'
         )

@@ -272,16 +272,16 @@ def test_rings_about_the_pole(run20):
     registration = ae.Registration(33.0, 0.4, (4.0, -3.0))
     projection = ae.analysis.image_compression(run).projection
     alone = Explorer(run)
-    assert alone.pole.label == "$111$" and alone.pole.fold == 3
-    assert alone.pole.place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding
+    assert alone.poles.pole(None).label == "$111$" and alone.poles.pole(None).fold == 3
+    assert alone.poles.pole(None).place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding
     maps = alone.show(ExplorerSettings(ae.Unperturbed(), 256, 0.0))
-    (rings,) = alone.rings(maps)
+    (rings,) = alone.poles.rings(maps, None)
     for ring, expected in zip(rings, ae.maps.ring_statistics(maps.simulated, projection, fold=3), strict=True):
         assert ring.contrast == pytest.approx(expected.contrast, rel=1e-9)
     measured = registration.hits(run.hits(ae.Unperturbed())).within_circle(30.0, registration.shift)
     explorer = Explorer(run, ae.Hits(x=measured.x, y=measured.y), registration)
-    assert explorer.pole.place == pytest.approx((4.0, -3.0), abs=1e-9)
-    first, second = explorer.rings(explorer.show(ExplorerSettings(ae.Unperturbed(), 256, 0.0)))
+    assert explorer.poles.pole(registration).place == pytest.approx((4.0, -3.0), abs=1e-9)
+    first, second = explorer.poles.rings(explorer.show(ExplorerSettings(ae.Unperturbed(), 256, 0.0)), registration)
     for one, other, moved in zip(first, second, rings, strict=True):
         assert one.contrast == pytest.approx(other.contrast, rel=1e-9)  # the same ions
         # other bins: within the noise of the counts
@@ -294,14 +294,15 @@ def test_poles_over_the_maps(run20):
     hits = TURNED.hits(run.hits(ae.Unperturbed()))
     explorer = Explorer(run, ae.Hits(x=hits.x, y=hits.y).within_circle(30.0, TURNED.shift), TURNED)
     settings = ExplorerSettings(ae.Unperturbed(), 64, 2.0)
-    drawn, alone = explorer.poles_over(explorer.show(settings)), Explorer(run).poles_over(Explorer(run).show(settings))
+    drawn = explorer.poles.overlay(explorer.show(settings), TURNED)
+    alone = Explorer(run).poles.overlay(Explorer(run).show(settings), None)
     on_detector = dict(zip(alone.labels, alone.places, strict=True))
     assert len(drawn.labels) >= 7 and drawn.labels[0] == "111"
     for label, place in zip(drawn.labels, drawn.places, strict=True):
         assert place == pytest.approx(np.array(TURNED.points(*on_detector[label])))
         assert math.hypot(*(place - TURNED.shift)) < 31.0
     bare = replace(run, settings={**run.settings, "tip": {"source": "a file"}})
-    assert Explorer(bare).poles_over(Explorer(bare).show(settings)) is None
+    assert Explorer(bare).poles.overlay(Explorer(bare).show(settings), None) is None
 
 
 def test_a_run_is_registered_where_the_indexed_map_has_its_axis(run20, measured, monkeypatch):
@@ -329,14 +330,14 @@ def test_a_run_is_registered_where_the_indexed_map_has_its_axis(run20, measured,
         else:
             with pytest.raises(KeyError, match="start"):
                 explorer.register([ae.Unperturbed()], apply=call)
-            assert explorer.registration_options == {}
+            assert explorer.search.options == {}
 
 
 @pytest.mark.parametrize(("axis", "label", "fold"), [((0, 0, 1), "$002$", 4), ((0, 1, 1), "$022$", 2)])
 def test_the_symmetry_of_a_pole(run, axis, label, fold):
     settings = run.settings | {"tip": run.settings["tip"] | {"axis": list(axis)}}
     explorer = Explorer(replace(run, settings=settings))
-    assert explorer._pole[0] == label and explorer._pole[2] == fold
+    assert explorer.poles.nearest[0] == label and explorer.poles.nearest[2] == fold
 
 
 @pytest.mark.slow
@@ -355,7 +356,7 @@ def test_the_best_registration_is_kept(run, measured):
     """Each better one is set at once; an error of the progress ends the search."""
     scores = iter([0.6, 0.9, 0.7])
     explorer, steps = Explorer(run, measured), []
-    explorer.registration_options = {"rotations": 0.0}
+    explorer.search.options = {"rotations": 0.0}
 
     def found(function, arguments):
         assert arguments[2] == {"rotations": 0.0}
@@ -412,11 +413,11 @@ def test_before_the_registration_both_maps_have_one_size(run, measured):
 
 def test_the_verdict_is_that_of_the_library(run, measured, explorer):
     maps = explorer.show(ExplorerSettings(ae.RollUp(ENERGY), 24, 2.0))
-    found = explorer.likeness(maps)
+    found = explorer.poles.likeness(maps, explorer.registration)
     expected = ae.maps.likeness(maps.simulated, maps.measured, TURNED)
     assert expected.verdict == "alike" and found.reason.startswith(expected.reason)
     # too few ions for lines about the pole, which are not a part of that
-    assert found.verdict == "doubtful" and explorer._structures(maps)[0] is None
+    assert found.verdict == "doubtful" and explorer.poles.structures(maps, explorer.registration)[0] is None
 
 
 @pytest.mark.slow
@@ -433,23 +434,23 @@ def test_the_verdict_takes_lines_about_the_pole(run20, emission, monkeypatch):
             measures.append(self)
             super().__init__(*arguments)
 
-    monkeypatch.setattr("apt_evap.explore.explorer.PoleMeasure", Counted)
+    monkeypatch.setattr("apt_evap.explore.poles_of_run.PoleMeasure", Counted)
     verdicts = {}
     for other in (ae.Unperturbed(), ae.RollUp(0.2)):
         maps = explorer.show(ExplorerSettings(other, 64, 2.0))
         assert ae.maps.likeness(maps.simulated, maps.measured, explorer.registration).verdict == "alike"
-        found = explorer.likeness(maps)
+        found = explorer.poles.likeness(maps, explorer.registration)
         verdicts[other] = found.verdict
         assert ("correlate only" in found.reason) == (other != emission)
         region = PoleMeasure(run, explorer.registration, maps.measured)
-        simulated, measured = explorer._structures(maps)
+        simulated, measured = explorer.poles.structures(maps, explorer.registration)
         assert np.array_equal(measured.values, region.structure(maps.measured).values, equal_nan=True)
         assert np.array_equal(simulated.values, region.structure(maps.simulated).values, equal_nan=True)
     assert {verdict for other, verdict in verdicts.items() if other != emission} == {"doubtful"}
     assert verdicts[emission] == "alike"
     assert len(measures) == 1  # the place of the pole and the measured structure are those of all emissions
     explorer.set_registration(ae.Registration(0.0, 1.0, (0.5, 0.0)))
-    explorer.likeness(explorer.show(ExplorerSettings(emission, 64, 2.0)))
+    explorer.poles.likeness(explorer.show(ExplorerSettings(emission, 64, 2.0)), explorer.registration)
     assert len(measures) == 2
 
 

@@ -631,7 +631,7 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     assert panel.simulate.label == "simulate this specimen"
     beside, view = explorer_and_view(make_parser().parse_args(["explore", str(run), "specimen.npz"]))
     start = index.settings(1.0, 1).registration["start"]  # the run is registered from there
-    assert beside.registration_options["start"].shift == pytest.approx(start.shift, abs=0.1)
+    assert beside.search.options["start"].shift == pytest.approx(start.shift, abs=0.1)
     panels = read_config(run.with_suffix(".toml")).maps.panels
     assert view.perturbation == panels[1].perturbation and view.perturbation.energy == 0.35
     again = Opened(Explorer(None, measured, file=MeasuredFile("specimen.npz")), state=state).page
