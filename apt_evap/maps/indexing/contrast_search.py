@@ -181,7 +181,11 @@ class Terms:
 
     def equal(self, directions: Floats) -> Floats:
         """Equal directions; of cubic crystals those next to [001], where the pixels are least distorted."""
-        return np.sort(np.abs(directions), axis=1) if self.structure != "hcp" else directions
+        if self.structure == "hcp":
+            return directions
+        x, y, z = np.abs(directions).T
+        low, high = np.minimum(x, y), np.maximum(x, y)
+        return np.stack([np.minimum(low, z), np.maximum(low, np.minimum(high, z)), np.maximum(high, z)], axis=1)
 
     def images(self, half_angle: float) -> np.ndarray:
         """Filtered terms for a field of view of this half angle [rad], from the pixel `corner` on, shape (k, n, m)."""

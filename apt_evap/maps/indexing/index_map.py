@@ -23,6 +23,7 @@ from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.maps.gains import Densities, DensityGains, density_gains
 from apt_evap.maps.indexing.contrast_search import Terms, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
+from apt_evap.maps.indexing.drawn_star import best_star
 from apt_evap.maps.indexing.halves_and_surrogates import second_grain, second_lattice, surrogates_of
 from apt_evap.maps.indexing.joint_search import CONTRAST, COUNTED, JOINT, JointSearch
 from apt_evap.maps.indexing.marked_poles import Mark, check_places, contradictory_marks, contradictory_pair, marks_of
@@ -47,6 +48,10 @@ LEAST_EVIDENCE = 6.0
 """Evidence of the local contrast of a whole map, over that of no crystal, from which on it is one: "strong" by
 R. E. Kass and A. E. Raftery, J. Am. Stat. Assoc. 90, 773 (1995). Four twins that the counts alone preferred, 5 to 21
 degrees off, have -13 to 4, right ones 22 and more, measured tungsten 16 to 26."""
+SEEN_STAR, OVER_STAR = 20.0, 30.0
+"""Evidence of the local contrast for a star of drawn lines (`drawn_star`) from which on there may be one, and evidence
+that an orientation must then have over it: twice the logarithm of the number of orientations and scales that a map
+distinguishes, 2 to 6 million."""
 CLEAR, UNSEEN, PART = 50.0, -40.0, 0.25
 """Evidence of the local contrast of a whole map from which on the winner must have the second number, and this part of
 the evidence, in every half, no crystal being 0. Measured tungsten, cut at 60 mm and indexed as [001], has 58, and in a
@@ -371,13 +376,14 @@ def index(
     Poisson's, so that a model that leaves structure unexplained decides less. The other one is twice the logarithm of
     the marginal likelihood of the local contrast. Their sum is the evidence of a result.
 
-    The map is `decided` if the first result passes four checks. (1) Its evidence is more than 20 above that of the next
+    The map is `decided` if the first result passes five checks. (1) Its evidence is more than 20 above that of the next
     different result. Results are different if they give crystal directions to the places of the map that are more than
     6 degrees apart (RMS): other orientations, or the same one at another scale. (2) No half of the map has another
     orientation with 12 more than the first result, and than no crystal, and if the local contrast of the map is clear,
-    the first result is seen in every half: else it may hold a second lattice. (3) The map is more
+    the first result is seen in every half: else it may hold a second lattice. (3) A drawing of
+    lines through one point, without a crystal, explains the local contrast less well, by 30. (4) The map is more
     than 3 standard deviations above the mean of its surrogates, and above all of them: maps with the same rings and
-    lines at random azimuths. (4) No other crystal structure, searched as hard, has 20 more; one that is within 20 is
+    lines at random azimuths. (5) No other crystal structure, searched as hard, has 20 more; one that is within 20 is
     named, as the result holds only if the specimen is what you say. The map also needs 4,000 ions. With marks of a user
     only the first check applies. The reason says which check refused, and what would help.
 
@@ -538,6 +544,14 @@ class _Crystal:
                 f"the map may hold a second grain: farther than {grain.chord:g} radii towards {grain.azimuth:.0f} "
                 f"degrees another orientation has more evidence, by {_floor(grain.evidence)} (at most "
                 f"{SECOND_GRAIN:g} is allowed); a map of one grain would help"
+            )
+        star = best_star(self.view.picture)
+        if star.evidence > SEEN_STAR and best.evidence < star.evidence + OVER_STAR:
+            return (
+                f"a drawing explains the local contrast without a crystal: {star.lines} line{'s' * (star.lines > 1)} "
+                f"through one point, with evidence {_floor(star.evidence)}; this orientation has "
+                f"{_floor(best.evidence)} ({OVER_STAR:g} more than the drawing are needed); a wider field of view, or "
+                "a marked pole would help"
             )
         surrogates = surrogates_of(self.view, self.search, self.terms, self.densities, self.bounds, best.fit)
         if surrogates.above or surrogates.deviations <= ABOVE_SURROGATES:

@@ -35,7 +35,9 @@ _LEVELS = 255 / math.sqrt(BRIGHTEST)  # stored values are square roots: noise of
 
 def pixels_of(directions: Floats) -> Floats:
     """Pixels, shape (2, n), of directions on the equal-area disc of a hemisphere; opposite directions are equal."""
-    x, y, z = np.where(directions[:, 2:] < 0, -directions, directions).T
+    if (directions[:, 2] < 0).any():
+        directions = np.where(directions[:, 2:] < 0, -directions, directions)
+    x, y, z = directions.T
     stretch = np.sqrt(2 / (1 + z)) / PIXEL
     return np.stack([y * stretch, x * stretch]) + HALF
 
