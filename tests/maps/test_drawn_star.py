@@ -75,7 +75,7 @@ def test_more_lines_cost_more():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lines", [3, 6])
+@pytest.mark.parametrize("lines", [2, 3])
 def test_drawn_stars_are_no_crystals(lines):
     """Both are preferred to other orientations by more than 20."""
     found = ae.index(drawn(0.3 + np.arange(lines) * math.pi / lines), "Ni")
