@@ -40,12 +40,19 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
     indexing = indexed(measured_of(options), options)
     tell(options, f"{indexing}")
+    found = indexing.to_dict()
+    if indexing.decided and options.distance:
+        found["compression"] = options.distance / indexing.best.projection.scale
+        tell(
+            options,
+            f"image compression {found['compression']:.2f}, flight length / scale: --compression of reconstruct",
+        )
     written = {}
     if indexing.candidates:  # of a map that can show no orientation there is no picture
         save_figure(picture, plot.indexing(indexing)[0].figure)
         tell(options, f"wrote {picture}")
         written = {"wrote": str(picture)}
-    tell_json(options, {**written, "file": options.file, **indexing.to_dict()})
+    tell_json(options, {**written, "file": options.file, **found})
     return 0
 
 

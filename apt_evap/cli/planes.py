@@ -11,7 +11,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Spacing and normal of the lattice planes in a cylinder of reconstructed ions, such as at a pole, and how\n"
         "sharp they are, beside what chance makes of ions without planes. The true spacing calibrates the\n"
-        "reconstruction: multiply the efficiency by the observed spacing divided by the true one."
+        "reconstruction: it says what the efficiency, or else the field factor, is to be multiplied by."
     )
     parser.epilog = (
         "example:\n"
@@ -33,7 +33,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--reach", type=float, default=1.0, metavar="Z", help="several spacings [nm]; default: 1")
     parser.add_argument(
-        "--spacing", type=float, metavar="D", help="true spacing [nm], for the factor of the efficiency"
+        "--spacing", type=float, metavar="D", help="true spacing [nm], for the factor of efficiency or field factor"
     )
     add_reading(parser)
     add_speech(parser)
@@ -66,9 +66,14 @@ def execute(options: argparse.Namespace) -> int:
         "tilt": planes.tilt,
     }
     if true is not None and planes.found:
-        factor = planes.spacing / true
-        result["efficiency_factor"] = factor
-        tell(options, f"the spacing is {true:g} nm with {factor:.3f} times the efficiency")
+        factor, error = planes.spacing / true, planes.spacing_error / true
+        other = factor**-0.5
+        result |= {"efficiency_factor": factor, "field_factor_factor": other}
+        tell(
+            options,
+            f"the spacing is {true:g} nm with {factor:.3f} ± {error:.3f} times the efficiency, or with {other:.3f} ± "
+            f"{error * other / (2 * factor):.3f} times the field factor: it depends on efficiency / field factor^2",
+        )
     tell_json(options, result)
     return 0
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from apt_evap.cli._declared_options import add_declared
-from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero
+from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero, numbers_type
 from apt_evap.cli._output import tell, tell_json
 
 _CONSTANTS = (
@@ -74,9 +74,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     surface.add_argument(
         "--check",
-        action="store_true",
-        help="sizes of the phases that an evolving shape has found, with errors; simulates its specimen, and compares "
-        "the density on the detector: minutes",
+        nargs="?",
+        const=(),
+        type=numbers_type,
+        metavar="H,K,L",
+        help="sizes of the phases that an evolving shape has found, with errors; simulates its specimen along this "
+        "crystal direction, and compares the density on the detector: minutes; default: that of a run, else 0,0,1",
     )
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
     add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
@@ -115,16 +118,15 @@ def execute(options: argparse.Namespace) -> int:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     picture = output.with_suffix(".png") if options.picture is None else picture_path(options.picture)
     check_output(picture, is_picture, options.force)
-    hits, known = _ions(options)
+    hits, known, crystal = _ions(options)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
     file = file_of(options)
     if options.species is None:  # ranges are then for the picture and the solutes
         file = replace(file, ranges=None)
-    if options.check and (options.shape == "cap" or "element" not in settings):
-        got = f"--shape {options.shape}" if options.shape == "cap" else "no --element"
-        raise ValueError(f"--check needs --shape evolving and --element, got {got}")
+    if options.check is not None:
+        material, axis = _crystal(options, settings, crystal)
     origins = None if options.origins is None else OriginTable.load(options.origins)
     selection = file.select(hits, note)
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
@@ -147,8 +149,8 @@ def execute(options: argparse.Namespace) -> int:
     result["assumed"] = [one._asdict() for one in assumed]
     if isinstance(reconstruction, EvolvingReconstruction):
         result["surface"] = _tell_surface(options, reconstruction)
-    if options.check:
-        result["check"] = _tell_check(options, reconstruction)
+    if options.check is not None:
+        result["check"] = _tell_check(options, reconstruction, material, axis)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -222,7 +224,21 @@ def _tell_surface(options, reconstruction):
     return found
 
 
-def _tell_check(options, reconstruction):
+def _crystal(options, settings, crystal):
+    """Material and axis of the specimen that is simulated: the options, or those of a run."""
+    from apt_evap.specimen.lattice import check_axis
+    from apt_evap.specimen.materials import as_material
+
+    material = settings.get("element", None if crystal is None else crystal.material)
+    if options.shape == "cap" or material is None:
+        got = f"--shape {options.shape}" if options.shape == "cap" else "no --element"
+        raise ValueError(f"--check needs --shape evolving and --element, got {got}")
+    material = as_material(material)
+    axis = options.check or ((0, 0, 1) if crystal is None else crystal.axis)
+    return material, check_axis(material.structure, axis, "--check")
+
+
+def _tell_check(options, reconstruction, material, axis):
     """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
     from apt_evap.reconstruction.phase_size import phase_sizes
     from apt_evap.reconstruction.specimen_check import check_specimen
@@ -233,17 +249,20 @@ def _tell_check(options, reconstruction):
     sizes = phase_sizes(reconstruction)
     for size in sizes:
         tell(options, str(size))
-    check = check_specimen(reconstruction)
-    tell(options, str(check))
+    check = check_specimen(reconstruction, material, axis=axis)
+    along = " ".join(f"{part:g}" for part in axis)
+    tell(options, f"{check}; simulated along [{along}]")
     found = {"explained": check.explained, "error": check.error, "confirmed": check.is_confirmed, "ions": check.ions}
+    found["axis"] = list(axis)
     return found | {"sizes": [size._asdict() for size in sizes]}
 
 
 def _ions(options):
-    """Ions of the file, and the constants that it determines."""
+    """Ions of the file, the constants that it determines, and the orientation of a run."""
     from apt_evap.cli._files import in_real_units, read
     from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.hits import Hits
+    from apt_evap.maps.crystallography.orientation import Orientation
     from apt_evap.reconstruction.constants import run_constants
     from apt_evap.simulation.run import Run
 
@@ -253,13 +272,13 @@ def _ions(options):
         perturbation = run.first_perturbation
         if options.perturbation is not None:
             perturbation = read_perturbation(options.perturbation)
-        return run.hits(perturbation), run_constants(run, _field(options))
+        return run.hits(perturbation), run_constants(run, _field(options)), Orientation.known(run.settings["tip"])
     if not isinstance(content, Hits):
         raise ValueError(f"reconstruct needs ions or a run, {options.file!r} contains a map")
     for name in ("real_units", "perturbation"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
-    return content, {}
+    return content, {}, None
 
 
 def _settings(options, known):

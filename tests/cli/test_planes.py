@@ -33,6 +33,7 @@ def test_spacing_and_normal_are_found(planes, capsys):
     np.testing.assert_allclose(found["normal"], [np.sin(np.radians(6)), 0, np.cos(np.radians(6))], atol=0.01)
     assert found["depth_resolution"] == pytest.approx(0.02, abs=0.006)
     assert found["efficiency_factor"] == pytest.approx(SPACING / 0.21, rel=0.01)
+    assert found["field_factor_factor"] == pytest.approx((0.21 / SPACING) ** 0.5, rel=0.01)
 
 
 def test_wrong_input_is_one_sentence(planes, capsys):

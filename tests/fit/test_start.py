@@ -143,8 +143,9 @@ def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
         x_edges_mm=indexing.map.x_edges,
         y_edges_mm=indexing.map.y_edges,
     )
-    assert main(["index", "measured.npz", "--element", "Ni", "--scales", "56,64", "--json"]) == 0
+    assert main(["index", "measured.npz", "--element", "Ni", "--scales", "56,64", "--distance", "90", "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
+    assert answer["compression"] == 90 / answer["candidates"][0]["scale"] == pytest.approx(1.5, rel=0.03)
     assert answer["verdict"] == "indexed" and (tmp_path / "measured_indexed.png").stat().st_size > 10_000
     arguments = ["start", "measured.npz", "--element", "Ni", "--scales", "56,64", "--minutes", "2", "-o", "mine.toml"]
     assert main(arguments) == 0
