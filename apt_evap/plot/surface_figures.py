@@ -63,7 +63,10 @@ def surface_history(
     axes = figure.subplots(2, 3).ravel()
     _slice(axes[0], result.cap_positions, names, species, "by the cap")
     _slice(axes[1], result.positions, names, species, "by the surface")
-    axes[0].legend(fontsize="small", markerscale=2, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4)  # beside no ion
+    # below the label of the axis, where it hides no ion
+    axes[0].legend(
+        fontsize="small", markerscale=2, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5
+    )
     axes[2].plot(history.depths, history.recession, color="C0", label="recession over that of a cap")
     axes[2].plot(history.depths, history.voltage, color="C1", label="voltage, measured")
     axes[2].plot(history.depths, history.model_voltage, color="C3", lw=1, label="voltage, of the surface")
