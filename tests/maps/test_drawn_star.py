@@ -84,6 +84,7 @@ def test_drawn_stars_are_no_crystals(lines):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "W_tap.raw").exists(), reason="needs the measured tungsten, which is not distributed")
+@pytest.mark.filterwarnings("ignore:.*1 of 66,388 ions lies far outside:apt_evap.warnings.DataWarning")
 def test_a_narrow_view_of_a_bright_cross_does_not_decide():
     """It fits [001] better than the true [011], by 34, and lines without a crystal better than both."""
     ions = ae.read(DATA / "W_tap.raw").with_masses(316.67, -7.3).window(mass_to_charge=(58.59, 62.27))
