@@ -102,7 +102,7 @@ def execute(options: argparse.Namespace) -> int:
     with recorded_warnings(() if options.quiet else IN_LINES):
         compare(
             options.run,
-            MeasuredSource(lambda _: _measured(options), Path(options.file)),
+            MeasuredSource(lambda _: _measured(options), Path(options.file), _file(options)),
             options.output or f"{Path(options.file).stem}_study",
             set_by_options(EnergyGrid),
             set_by_options(FitSettings),
@@ -115,6 +115,13 @@ def execute(options: argparse.Namespace) -> int:
             command=shlex.join(["apt-evap", *options.arguments]),
         )
     return 0
+
+
+def _file(options):
+    """How MEASURED is read, None if it is a run: its composition is known."""
+    from apt_evap.cli._files import file_of
+
+    return file_of(options) if options.perturbation is None else None
 
 
 def _measured(options):

@@ -35,6 +35,7 @@ from apt_evap.spectra.isotope_comb import in_intervals
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
+_REACH = 4  # pixels from the mouse to a peak
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
 _CURVE = "#8298b0"  # seen in both styles
 _UNEXPLAINED = "#ff4040"
@@ -185,10 +186,10 @@ class SpectrumPanel:
         self._draw()
         for show in self.shown:
             show(named)
-        self.composition.text = _composition_table(named.composition)
         composed = len(str(named.composition).splitlines()) - 1
-        parts = [escape(line) for line in str(named).splitlines()[:-composed]]
-        parts[0] = f'<span style="color: {_UNEXPLAINED}">▼</span> {parts[0]}'
+        unexplained, *parts = (escape(line) for line in str(named).splitlines()[:-composed])
+        mark = f'<span style="color: {_UNEXPLAINED}">▼</span>'
+        self.composition.text = f"{mark} {unexplained}<br>{_composition_table(named.composition)}"
         self.text.text = "<br>".join(parts)
         self.peak.text = "Click a peak to see which ions it may be; drag over peaks to see the map of their ions."
         formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
@@ -249,11 +250,20 @@ class SpectrumPanel:
     # ---- the selection ---------------------------------------------------------------------------------------------
 
     def _clicked(self, event):
-        """Say which ions a peak may be."""
+        """Say which ions the highest peak may be that is a few pixels from the mouse."""
         if self.named is None or not event.x > 0:
             return
-        names = self.named.candidates(event.x)
-        self.peak.text = f"{event.x:.4g} Da: {escape(', '.join(names) or 'no ion')}"
+        shown, edges = self.figure.x_range, self.counts.data["x"]
+        reach = _REACH * (shown.end - shown.start) / (self.figure.inner_width or self.figure.height)
+        near = np.flatnonzero(np.abs(edges - event.x) <= max(reach, edges[1]))
+        if not len(near):
+            return
+        top = near[np.argmax(self.counts.data["y"][near])]
+        mass = self.named.hits.mass_to_charge
+        inside = mass[(mass >= edges[max(top - 1, 0)]) & (mass < edges[top] + 2 * edges[1])]
+        place = float(np.median(inside)) if len(inside) else event.x
+        names = self.named.candidates(place)
+        self.peak.text = f"{place:.5g} Da: {escape(', '.join(names) or 'no ion')}"
 
     def _dragged(self, event):
         box = event.geometry

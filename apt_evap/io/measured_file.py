@@ -206,6 +206,16 @@ class MeasuredFile:
             return selection
         return self._in_peaks(selection, note)
 
+    def spectrum(self, read: Callable[..., Any] = formats.read) -> Spectrum | None:
+        """Spectrum of all ions, however their masses are selected; of the ranges, if there are; None without masses."""
+        hits = self.load(read)
+        if not isinstance(hits, Hits) or not self._knows_masses(hits.columns):
+            return None
+        ranges = None if self.ranges is None else formats.read_ranges(self.ranges)
+        distance = self.distance if self._computes(hits.columns) else None
+        every = replace(self, distance=None, mass=None, ranges=None, species=None, peaks=None)
+        return spectrum(every.select(hits), ranges=ranges, distance=distance, time_zero=self.time_zero)
+
     def _in_peaks(self, hits, note):
         """The ions in the peaks of the element, and which ones they are as a note."""
         made: list[Spectrum] = []

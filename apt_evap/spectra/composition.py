@@ -59,7 +59,8 @@ class Composition:
     def plain(self) -> dict[str, object]:
         """As in the JSON of ``apt-evap composition``."""
         shares = {e: {"at_percent": value, "error": self.error[e]} for e, value in self.at_percent.items()}
-        return {"composition": shares, "unexplained": self.unexplained}
+        reason = {"refused": self.refused} if self.refused else {}
+        return {"composition": shares, "unexplained": self.unexplained, **reason}
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ _MOST_IONS = (14, 24, 60, 60)
 _OWN_SHIFT = 5e-4  # of the peaks of an ion of its own, once the others have names
 _ALIKE = 30.0
 """Chi-squared and costs by which another name of a peak may be worse: then both are named."""
+_ONE_PEAK = 4.0  # standard deviations of 1 Da, below which a hydride may be the isotopes of its metal
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60
 _MANY = 0.01  # of all ions: an element with such an ion is there
@@ -453,6 +454,10 @@ class Explainer:
                     others.append((total, other))
                     explanation.sets.append(([*rest, other], self.amounts(fit, [*rest, other])[0], total - value))
             explanation.others.append([other for _, other in sorted(others)[:3]])
+        for number, bare in self._in_one_peak(fit, kept):
+            rest = [other for other in kept if other != number]
+            explanation.sets.append((rest, self.amounts(fit, rest)[0], 0.0))
+            explanation.others[kept.index(number)].insert(0, bare)
         for others, more in sets:
             numbers = choice.numbers(others).tolist()
             explanation.sets.append((numbers, self.amounts(fit, numbers)[0], more))
@@ -461,6 +466,17 @@ class Explainer:
             for number, others in zip(kept, explanation.others, strict=True):
                 others += [other for other in more if fit.main[other] == fit.main[number] and other not in others]
         return explanation
+
+    def _in_one_peak(self, fit, kept):
+        """Hydrides whose lines are in one broad peak with those of the ion without hydrogen, and these ions."""
+        for number in kept:
+            ion = fit.ions[number]
+            rest = {name: count for name, count in ion.atoms.items() if name != "H"}
+            bare = [n for n in kept if fit.ions[n].charge == ion.charge and fit.ions[n].atoms == rest]
+            if n := next(iter(bare if "H" in ion.atoms else ()), None):
+                mass = float(fit.contents.mass[fit.main[n]])
+                if math.log1p(1 / (ion.charge * mass)) < _ONE_PEAK * float(self.peaks.scale.sigma(mass)):
+                    yield number, n
 
     def _with_shifted(self, choice, chosen):
         """Further ions of known elements, whose peaks lie beside the smooth calibration."""

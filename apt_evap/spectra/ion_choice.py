@@ -17,7 +17,7 @@ _RAREST = 0.005  # share of the atoms that counts as that of rarer ones
 _UNUSUAL = (
     15.0  # of unusual molecules, of three atoms of a metal, and of a charge of three or more without the one below
 )
-_PAIR = 40.0  # of two atoms of a metal with two charges, with or without hydrogen: at the m/n of one atom with one
+_PAIR = 40.0  # of two atoms of a metal with two charges, alone, with hydrogen, or as twice another ion: at its m/n
 _NO_ATOMS = 60.0  # of an element without an atomic ion
 _HEAVY_GASES, _NO_GAS = ("C", "N", "O"), 20.0  # cost of one of these without an atomic ion; H is often in hydrides only
 UNNAMED = 40.0
@@ -91,7 +91,8 @@ class IonChoice:
                 atomic[at] = self._place[next(iter(counts))]
             metals = max((number for name, number in counts.items() if name not in (*GASES, "D")), default=0)
             unusual[at] = _UNUSUAL * (ion.formula in UNUSUAL or metals > 2)
-            unusual[at] += _PAIR * (ion.charge == 2 and metals == 2 and set(counts) - {"H", "D"} <= _metals_of(counts))
+            twice = set(counts) - {"H", "D"} <= _metals_of(counts) or not any(n % 2 for n in counts.values())
+            unusual[at] += _PAIR * (ion.charge == 2 and metals == 2 and twice)
         self.atoms = np.vstack([self.atoms, atoms])
         self._charge = np.concatenate([self._charge, charge]).astype(int)
         self._atomic = np.concatenate([self._atomic, atomic]).astype(int)

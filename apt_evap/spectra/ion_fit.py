@@ -87,7 +87,7 @@ class IonFit:
         self._rows = np.hstack([np.diag(1 / self.error), np.zeros((self.number, self.number))])
         self._products: dict[int, Floats] = {}
         self._refresh()
-        self._absent = np.zeros(self.number)
+        self._absent, self._own = np.zeros(self.number), np.zeros(self.number, bool)
         self.missed, self.main, self.largest = np.zeros(self.number), np.arange(self.number), np.ones(self.number)
         self.shares = np.eye(self.number)
         """Share of the ions of each column in each peak, shape (columns, n)."""
@@ -114,6 +114,7 @@ class IonFit:
         share = np.concatenate([shares for _, shares in lines])
         contents, shifts = np.zeros((len(new), n)), np.zeros((len(new), n))
         missed, absent = np.bincount(owner, share, minlength=len(new)), np.zeros(len(new))
+        own = np.zeros(len(new), bool)
         if n:
             near = np.searchsorted(mass, places)[:, None] + np.arange(-2, 2)
             inside = (near >= 0) & (near < n)
@@ -136,8 +137,12 @@ class IonFit:
             )
             nearest = np.argmin(seen_distance, axis=1)
             own = np.bincount(owner, on_peak & (share > _OWN_LINE), minlength=len(new)) >= _OWN_LINES
-            joined = ~held & own[owner] & (seen_distance[line, nearest] < _JOINED * self.scale.sigma(places))
-            np.add.at(contents, (owner[joined], near[line, nearest][joined]), share[joined])
+            joined = ~held & (seen_distance[line, nearest] < _JOINED * self.scale.sigma(places))
+            beside = near[line, nearest]
+            np.add.at(contents, (owner[joined], beside[joined]), share[joined])
+            alone = joined & ~own[owner]  # others move the centre of gravity of the peak
+            shift = np.log(places / mass[beside])
+            np.add.at(shifts, (owner[alone], beside[alone]), (share * shift)[alone])
             missed = np.bincount(owner, share * ~(held | joined), minlength=len(new))
             none = ~(held | joined)
             absent = np.bincount(owner[none], (share / self._noise(places))[none] ** 2, minlength=len(new))
@@ -150,7 +155,7 @@ class IonFit:
         }
         self._rows = np.vstack([self._rows, rows])
         self.shares = np.vstack([self.shares, contents])
-        self.missed = np.concatenate([self.missed, missed])
+        self.missed, self._own = np.concatenate([self.missed, missed]), np.concatenate([self._own, own])
         self._absent = np.concatenate([self._absent, absent])
         main = np.argmax(contents, axis=1) if n else np.zeros(len(new), int)
         self.main = np.concatenate([self.main, main])
@@ -166,10 +171,10 @@ class IonFit:
         return np.sqrt(counts + 4 + more**2)
 
     def possible(self, numbers: Rows) -> Booleans:
-        """Whether ions have most of their isotopes in the spectrum, and a peak for the most abundant one."""
+        """Whether ions have most of their isotopes in the spectrum, and a peak for the most abundant one or for two."""
         if not self.number:
             return np.zeros(len(numbers), bool)
-        seen = (self.contents.seen | self._hidden)[self.main[numbers]]
+        seen = (self.contents.seen | self._hidden)[self.main[numbers]] | self._own[numbers]
         return (self.missed[numbers] <= _MISSED) & (self.largest[numbers] > 0) & seen
 
     def _product(self, number):

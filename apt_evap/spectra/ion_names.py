@@ -23,9 +23,9 @@ HIGHEST_CHARGE = {
     "Dy": 3, "Ho": 3, "Er": 3, "Tm": 3, "Yb": 3, "Lu": 3, "Hf": 4, "Ta": 4, "W": 4, "Re": 4, "Os": 4, "Ir": 3, "Pt": 3,
     "Au": 2, "Hg": 2, "Tl": 1, "Pb": 2, "Bi": 2, "Th": 4, "U": 4,
 }
-"""Highest charge state of an atomic ion that is tried. Post-ionisation up to about 60 V/nm (Kingham, Surf. Sci. 116,
-273 (1982)), and what atom probes report (Gault et al., Atom Probe Microscopy, Springer (2012)); never more than the
-electrons of the atom, nor a noble gas shell."""
+"""Highest charge state of an atomic ion that is tried: see the tables of docs/composition.rst, with ionisation energies
+(NIST) and fields by the curves of Kingham, Surf. Sci. 116, 273 (1982). Never more than the electrons of the atom, nor a
+noble gas shell."""
 GASES = ("H", "C", "N", "O")
 """Elements of the residual gas, and of organic molecules: they need no atomic ion."""
 NOBLE = ("He", "Ne", "Ar", "Kr", "Xe")

@@ -84,7 +84,7 @@ class UnexplainedPeak:
     mass : float
         m/n [Da].
     ions : float
-        Ions above the background without an explanation.
+        Ions above the background without an explanation; below zero if its ions should have more.
     perhaps : str
         An ion of this m/n that has no other evidence; "" if there is none.
     """
@@ -94,7 +94,8 @@ class UnexplainedPeak:
     perhaps: str = ""
 
     def __str__(self) -> str:
-        return f"{self.mass:.5g} Da ({self.ions:,.0f} ions{f', perhaps {self.perhaps}' if self.perhaps else ''})"
+        ions = f"{self.ions:,.0f} ions" if self.ions > 0 else f"{-self.ions:,.0f} ions are missing"
+        return f"{self.mass:.5g} Da ({ions}{f', perhaps {self.perhaps}' if self.perhaps else ''})"
 
 
 class Spectrum:
@@ -349,14 +350,15 @@ class _Named:
                 for numbers, x, worse in explanation.sets
             ],
         )
-        rest = contents.ions - fit.explained(explanation.chosen, explanation.amplitudes)
-        large = contents.seen & (rest > np.maximum(_UNLIKE * contents.ions, _FEWEST))
-        large &= rest > _CLEAR * np.sqrt(contents.variance)
+        model = fit.explained(explanation.chosen, explanation.amplitudes)
+        rest = contents.ions - model  # below zero where the ions should have more
+        large = np.abs(rest) > np.maximum(_UNLIKE * np.maximum(contents.ions, model), _FEWEST)
+        large &= (np.abs(rest) > _CLEAR * np.sqrt(contents.variance)) & (contents.seen | (rest < 0))
         self.unexplained = tuple(
             UnexplainedPeak(float(contents.mass[at]), float(rest[at]), _perhaps(explanation, float(contents.mass[at])))
-            for at in sorted(np.flatnonzero(large), key=lambda at: -rest[at])
+            for at in sorted(np.flatnonzero(large), key=lambda at: -abs(rest[at]))
         )
-        self.unexplained_part = float(rest[large].sum() / max(contents.total, 1.0))
+        self.unexplained_part = float(np.abs(rest[large]).sum() / max(contents.total, 1.0))
         self.either = tuple(explanation.either.items())
 
     def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
@@ -393,8 +395,8 @@ class _Ranged:
 
     def __init__(self, peaks: PeakContents, ranges: Ranges, abundances: Abundances, mass: Floats) -> None:
         contents = peaks.fit()
-        self.calibration, self.background = MassCalibration(), contents.background
         self._ranged = RangedIons(peaks, contents, ranges, abundances)
+        self.calibration, self.background = self._ranged.calibration, contents.background
         ions, covariance = self._ranged.amounts(mass)
         errors = np.sqrt(np.maximum(np.diag(covariance), 0)).tolist()
         named = []

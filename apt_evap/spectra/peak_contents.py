@@ -6,14 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap.spectra.peak_scale import BINS, HIGHEST, LOWEST, PeakScale, find_places
+from apt_evap.spectra.peak_scale import BINS, HIGHEST, LOWEST, PeakScale, centroid, find_places
 
 _SHORT, _LONG = 30 * BINS, 110 * BINS  # bins of a peak on both sides of its place; the long tail is at high masses
-_TAILS = (0.0, 1.5, 4.0, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
+_TAILS = (0.0, 1.5, 2.5, 4.5, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
+_CORE = 0.75  # standard deviation of the normal distribution of a peak with a tail, over that of the left side
 _LONGEST = 0.014  # of ln m/n at 30 Da: longer tails are not of one peak
 _TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
-_MIXTURE = ((0.6, 0.2, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
+_MIXTURE = ((0.4, 0.25, 0.15, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
 _STRONG = 3000  # ions of a peak that has a mixture of tails of its own
+_ALONE = 12.0  # standard deviations to the next peaks, for tails of its own
+_SMALL = 0.03  # height over its own of a peak that does not count
 _BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
 _NEIGHBOURS = 0.10  # relative error of the tails of other peaks below a peak
 _ROUNDS, _ITERATIONS = 3, 120
@@ -68,7 +71,7 @@ class PeakContents:
         self._mixture = np.array([*_MIXTURE[0][: len(self._tails)], *_MIXTURE[1]])
         self._start: Floats | None = None  # amplitudes of the background of the last fit
 
-    def fit(self, expected: Floats | None = None, rounds: int = _ROUNDS) -> Contents:
+    def fit(self, expected: Floats | None = None) -> Contents:
         """Numbers of ions at the peaks, and at further places where ions are expected [Da]."""
         more = np.zeros(0) if expected is None else np.asarray(expected, float)
         mass = np.concatenate([self.seen_at, more])
@@ -77,14 +80,16 @@ class PeakContents:
         mass, seen = mass[order], seen[order]
         place = np.clip(self.scale.bins(mass), 0, self.scale.size - 1)
         height = self._smooth[np.rint(place).astype(int)]
-        # strong peaks have tails of their own, from which the shape of the others is learnt
+        # strong peaks have tails of their own, or common ones if other peaks are near; the others have their mean
         near = np.array([height[np.abs(place - centre) < 60 * BINS].max() for centre in place])
         strong = seen & (height > 0.03 * near) & (height * BINS * 2.5 > _STRONG)
+        common = (strong & ~_isolated(place, height))[strong]
         mixture = self._mixture / self._mixture.sum()
+        rounds = _ROUNDS if self._start is None else _ROUNDS - 1  # the next fits begin with the shape of the last
         for number in range(rounds):
             last = number == rounds - 1
             iterations = _ITERATIONS if last else _ITERATIONS // 3
-            ions, shares, below = self._maximise(place, height, strong, mixture, iterations)
+            ions, shares, below = self._maximise(place, height, strong, common, mixture, iterations)
             if strong.any():
                 weights = np.sqrt(ions[strong])
                 mixture = np.maximum((shares[strong] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
@@ -94,7 +99,7 @@ class PeakContents:
         return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes,
                         np.convolve(self.counts, np.ones(2 * CORE + 1), "same"))  # fmt: skip
 
-    def _maximise(self, place, height, strong, mixture, iterations):
+    def _maximise(self, place, height, strong, common, mixture, iterations):
         """Ions and shares of the tails of each peak, and the background, by expectation and maximisation."""
         from scipy.sparse import hstack
 
@@ -112,11 +117,15 @@ class PeakContents:
             self._start = np.full(self._smooth_background.shape[1], np.percentile(self.counts, 30) / 2 + 1e-3)
             self._start /= max(float(np.median(np.asarray(self._smooth_background.sum(1)).ravel())), 1e-9)
         amplitudes[len(owner) :] = np.maximum(self._start, 1e-6 * self._start.max() + 1e-12)
+        own = kinds < len(self._bases)
+        rows = np.flatnonzero(own).reshape(-1, len(self._bases))
         for _ in range(iterations):
             amplitudes *= (transposed @ (self.counts / (every @ amplitudes + 1e-9))) / norm
+            if common.any():
+                parts = amplitudes[rows]
+                amplitudes[rows[common]] = parts[common].sum(1, keepdims=True) * (parts.sum(0) / parts.sum())
         self._start = amplitudes[len(owner) :].copy()
         of_kind = np.zeros((len(place), len(self._bases)))
-        own = kinds < len(self._bases)
         of_kind[owner[own], kinds[own]] = amplitudes[: len(owner)][own]
         ions = np.bincount(owner, amplitudes[: len(owner)], minlength=len(place))
         shares = of_kind / np.maximum(of_kind.sum(1, keepdims=True), 1e-9)
@@ -155,22 +164,29 @@ class PeakContents:
         return np.maximum(every, 1) / core**2 + (_NEIGHBOURS * others / core) ** 2 + 4.0
 
 
+def _isolated(place, height):
+    """Whether no other peak of some height is so near that tails could be exchanged."""
+    near = (np.abs(place[:, None] - place) < _ALONE * BINS) & (height > _SMALL * height[:, None])
+    return near.sum(1) < 2  # itself
+
+
 def _bases(scale):
     """Lengths of the tails to high masses, and shapes of peaks: normal, with each of the tails, shape (k, bins)."""
     from scipy.special import ndtr
 
     size = _SHORT + _LONG + 1
-    edges = (np.arange(-_SHORT, _LONG + 2) - 0.5) / BINS
     tails = [length for length in _TAILS if length * float(scale.sigma(30.0)) < _LONGEST]
-    normal = np.diff(ndtr(edges))
-    mirrored = np.diff(ndtr((np.arange(-_LONG, _SHORT + 2) - 0.5) / BINS))
     shapes = []
-    for length, core in [(t, normal) for t in tails] + [(t, mirrored) for t in _TAILS_BEFORE]:
-        shape = core
-        if length:
-            decay = np.exp(-np.arange(size) / (BINS * length))
-            shape = np.convolve(core, decay / decay.sum())[:size]
-        shapes.append(shape if core is normal else shape[::-1])
+    for length, before in [(t, False) for t in tails] + [(t, True) for t in _TAILS_BEFORE]:
+        zero, shift = (_LONG if before else _SHORT), 0.0
+        for _ in range(2):  # with the middle of the peak, as `find_places` sees it, at its place
+            edges = (np.arange(size + 1) - zero - 0.5 + shift) / BINS
+            shape = np.diff(ndtr(edges / (_CORE if length else 1.0)))
+            if length:
+                decay = np.exp(-np.arange(size) / (BINS * length))
+                shape = np.convolve(shape, decay / decay.sum())[:size]
+            shift = centroid(shape, int(np.argmax(shape))) - zero
+        shapes.append(shape[::-1] if before else shape)
     bases = np.array(shapes)
     bases[bases < 1e-7] = 0
     return tails, bases

@@ -141,10 +141,10 @@ def find_places(counts: Floats) -> tuple[Floats, Floats]:
                 kept[-1] = top
             continue
         kept.append(top)
-    return np.array([_centroid(counts, top) for top in kept]), smooth
+    return np.array([centroid(counts, top) for top in kept]), smooth
 
 
-def _centroid(counts, top):
+def centroid(counts: Floats, top: int) -> float:
     """Centre of gravity of the middle of a peak [bins]."""
     place = float(top)
     for _ in range(4):

@@ -1,6 +1,5 @@
 """Ions of the ranges of a file: their numbers from all ranges together, without the background."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -8,11 +7,13 @@ import numpy as np
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind
 from apt_evap.spectra.ion_names import Abundances, Ion, formula_of_atoms
+from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.spectra.peak_contents import Contents, PeakContents
 
 _BELOW, _ABOVE = 0.006, 0.002  # of m/n, by which an isotope may lie outside its range
 _HIGHEST = 4  # charge
+_LARGE, _PLACE, _MOST_POINTS = 0.1, 3e-4, 60  # abundance over the largest, and error of a place of the calibration
 _SHAPE = 0.01  # relative error of the ions of a range: its bounds and the shape
 _BACKGROUND = 0.1  # relative error of the background
 _UNLIKE = 0.2  # part of the ions of a range that its ions do not explain, from which it is named
@@ -66,6 +67,7 @@ class RangedIons:
         self.ions, self.rows = self._find()
         if not self.ions:
             raise ValueError(f"ranges must contain isotopes of their ions, got {ranges!r}")
+        self.calibration = self._calibrated()
         self._columns = np.array([self._column(ion) for ion in self.ions]).T
         below = np.pad(np.cumsum(contents.background), (1, 0))
         places = peaks.scale.bins(np.concatenate([ranges.low, ranges.high])) + 0.5
@@ -99,21 +101,30 @@ class RangedIons:
     def _inside(self, masses, row):
         return (masses > self.ranges.low[row] * (1 - _BELOW)) & (masses < self.ranges.high[row] * (1 + _ABOVE))
 
+    def _calibrated(self):
+        """The calibration by the peaks in ranges that are where an isotope of their ions should be."""
+        seen, points = self._peaks.seen_at, []
+        for ion, rows in zip(self.ions, self.rows, strict=True):
+            masses, shares = self._abundances.lines(ion.formula)
+            for mass in masses[shares > _LARGE * shares.max()] / ion.charge:
+                row = next((row for row in rows if self._inside(np.array([mass]), row)[0]), None)
+                if row is None:
+                    continue
+                near = seen[(seen >= self.ranges.low[row]) & (seen < self.ranges.high[row])]
+                shift = near / mass - 1
+                if len(near) and np.abs(shift).min() < _BELOW:
+                    points.append((float(mass), float(shift[np.argmin(np.abs(shift))]), _PLACE))
+        calibration = MassCalibration()
+        calibration.learn(points[:_MOST_POINTS])
+        return calibration
+
     def _column(self, ion):
         """Part of an ion in each range, with the tails of its peaks."""
         masses, shares = self._abundances.lines(ion.formula)
-        scale, seen = self._peaks.scale, self._peaks.seen_at
+        scale = self._peaks.scale
         bounds = scale.bins(np.stack([self.ranges.low, self.ranges.high]))
         column = np.zeros(len(self.ranges))
-        for mass, share in zip(masses / ion.charge, shares, strict=True):
-            place = mass
-            rows = [row for row in range(len(self.ranges)) if self._inside(np.array([mass]), row)[0]]
-            if rows:  # the peak in the range is where the isotope is
-                near = seen[(seen >= self.ranges.low[rows[0]]) & (seen < self.ranges.high[rows[0]])]
-                if len(near):
-                    place = float(near[np.argmin(np.abs(np.log(near / mass)))])
-                    if abs(math.log(place / mass)) > 2 * _BELOW:
-                        place = mass
+        for place, share in zip(self.calibration.place(masses / ion.charge), shares, strict=True):
             column += share * self._peaks.between(self._shape, bounds - scale.bins(place))
         return column
 

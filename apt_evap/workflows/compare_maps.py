@@ -139,12 +139,22 @@ def compare(
                     if not isinstance(message, RegistrationWarning)
                 ],
                 sections=() if sections is None else sections(study),
+                spectrum=_spectrum(source, content, note),
             )
     note("\n".join(study.lines()))
     if folder is not None:
         check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
         note(f"wrote {', '.join(FILES)} to {folder}{check}")
     return study
+
+
+def _spectrum(source, content, note):
+    """Spectrum of the measured ions, None without one."""
+    try:
+        return source.spectrum(content)
+    except ValueError as error:
+        note(f"no composition in the report: {error}")
+        return None
 
 
 def _run_and_file(run: Run | Simulated | AnyPath) -> tuple[Run, Path | None]:

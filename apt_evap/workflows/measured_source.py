@@ -12,6 +12,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.simulation.read_file import read
+from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,13 @@ class MeasuredSource:
     def name(self) -> str:
         """Name of the file, or "measured"."""
         return "measured" if self.path is None else self.path.name
+
+    def spectrum(self, content: Hits | DetectorMap) -> Spectrum | None:
+        """Spectrum of all ions of the file, or of the content that was read; None without masses."""
+        if self.file is not None:
+            return self.file.spectrum(read)
+        has_masses = isinstance(content, Hits) and content.mass_to_charge is not None
+        return spectrum(content) if has_masses else None  # type: ignore[arg-type]
 
     def made_from(self) -> dict[str, Any]:
         """Record of the file and its options, or of the ions or the map."""

@@ -286,7 +286,7 @@ class Twin:
 
     def _as_read(self):
         """The measurement, with its file for the report, without reading it again."""
-        return MeasuredSource(lambda _: self.measured, self._source.path)
+        return MeasuredSource(lambda _: self.measured, self._source.path, self._source.file)
 
     # ---- texts -------------------------------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from apt_evap._common.validation import check_kind
 from apt_evap.analysis.description import lens_text
 from apt_evap.fit.study import PREDICTED, RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.directions import plain_label
+from apt_evap.plot.report.composition_report import composition_section
 from apt_evap.plot.report.html_page import (
     Page,
     collapsed,
@@ -25,6 +26,7 @@ from apt_evap.plot.report.html_page import (
 )
 from apt_evap.plot.report.origin import add_origin, origin
 from apt_evap.plot.report.pictures import blinking_pictures
+from apt_evap.spectra.mass_spectrum import Spectrum
 
 _COLORS = "viridis"  # of the matrix, as of `plot.score_matrix`
 _LONG = ("run", "registered", "share_above_energy_limit")  # settings in tables of their own, or only for programs
@@ -43,6 +45,7 @@ def write_study(
     command: str = "",
     warnings: Sequence[str] = (),
     sections: Sequence[str] = (),
+    spectrum: Spectrum | None = None,
 ) -> None:
     """Write a study as one HTML file.
 
@@ -69,6 +72,8 @@ def write_study(
         Warnings of the study.
     sections : sequence of str
         More parts of the page, as HTML.
+    spectrum : Spectrum, optional
+        Spectrum of the measured ions, for their composition.
 
     Raises
     ------
@@ -85,6 +90,8 @@ def write_study(
     if reasons[_SHOWN:]:
         page.add(collapsed("More doubts", "\n".join(paragraph(text, "doubt") for text in reasons[_SHOWN:])))
     page.add(*_evidence(page, study), *sections)
+    if spectrum is not None:
+        page.add(composition_section(page, check_kind(spectrum, "spectrum", Spectrum, "a Spectrum")))
     if study.likeness.verdict == "alike":
         page.add(collapsed("Energies", _energies(study)), collapsed("Scores on the grid", _grid(study)))
     for caption, figure in (figures or {}).items():
