@@ -151,7 +151,9 @@ def compare(
 def _spectrum(source, content, note):
     """Spectrum of the measured ions, None without one."""
     try:
-        return source.spectrum(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the file: said when it was read first
+            return source.spectrum(content)
     except ValueError as error:
         note(f"no composition in the report: {error}")
         return None

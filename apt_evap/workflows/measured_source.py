@@ -39,10 +39,10 @@ class MeasuredSource:
         return "measured" if self.path is None else self.path.name
 
     def spectrum(self, content: Hits | DetectorMap) -> Spectrum | None:
-        """Spectrum of all ions of the file, or of the content that was read; None without masses."""
+        """Spectrum of all ions of the file, or of the ions in memory; None without masses, and of a run."""
         if self.file is not None:
             return self.file.spectrum(read)
-        has_masses = isinstance(content, Hits) and content.mass_to_charge is not None
+        has_masses = self.path is None and isinstance(content, Hits) and content.mass_to_charge is not None
         return spectrum(content) if has_masses else None  # type: ignore[arg-type]
 
     def made_from(self) -> dict[str, Any]:

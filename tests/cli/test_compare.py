@@ -150,12 +150,20 @@ def test_files_of_others_are_kept(folder, capsys):
 @pytest.mark.slow
 @NO_PICTURES
 def test_ions_and_runs_are_taken_too(folder):
-    assert main(["compare", "run.h5", "ions.epos", *QUICK, *HERE, "--quiet", "--mechanism", "lateral"]) == 0
+    hits = ae.load("other.h5").hits(ROLLUP).within_circle(60.0)
+    masses = 26.98 * np.random.default_rng(1).normal(1, 4e-4, len(hits))
+    ae.write("ions.epos", ae.Hits(x=hits.x, y=hits.y, mass_to_charge=masses))
+    selected = ["--mass", "20,30"]  # for the map only
+    assert main(["compare", "run.h5", "ions.epos", *QUICK, *HERE, "--quiet", "--mechanism", "lateral", *selected]) == 0
+    report = Path("ions_study/report.html").read_text()
+    section = report[report.index("<summary>Composition") :]
+    assert "<th>Al</th><td>100.00" in section and "unexplained: 0.0%" in section
     held = json.loads(Path("ions_study/study.json").read_text())
     assert held["grid"]["mechanism"] == "lateral" and held["ceiling"] is not None
     arguments = ["run.h5", "other.h5", *QUICK, *HERE, "--quiet", "-o", "again"]
     assert main(["compare", *arguments, "--perturbation", "RollUp:0.2,0.1"]) == 0
     assert "RollUp" in json.loads(Path("again/study.json").read_text())["settings"]["measured"]
+    assert "<summary>Composition" not in Path("again/report.html").read_text()
 
 
 @pytest.mark.slow
