@@ -35,7 +35,7 @@ from apt_evap.spectra.isotope_comb import in_intervals
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
-_REACH = 4  # pixels from the mouse to a peak
+_REACH = 0.01  # of the shown masses, from the mouse to a peak: 3 to 8 pixels
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
 _CURVE = "#8298b0"  # seen in both styles
 _UNEXPLAINED = "#ff4040"
@@ -254,7 +254,7 @@ class SpectrumPanel:
         if self.named is None or not event.x > 0:
             return
         shown, edges = self.figure.x_range, self.counts.data["x"]
-        reach = _REACH * (shown.end - shown.start) / (self.figure.inner_width or self.figure.height)
+        reach = _REACH * (shown.end - shown.start)
         near = np.flatnonzero(np.abs(edges - event.x) <= max(reach, edges[1]))
         if not len(near):
             return
