@@ -59,4 +59,7 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
     flight = {"distance": options.distance, "time_zero": options.time_zero}
     # ranges are not for a selection of ions; flight length and time zero are fitted
     chosen = replace(file_of(options), ranges=None, distance=None)
-    return spectrum(chosen.select(hits), elements, ranges, abundances_of(options.isotope), **flight)
+    ions = chosen.select(hits)
+    if ions.mass_to_charge is not None and not (ions.detected & (ions.mass_to_charge > 0)).any():
+        raise ValueError(f"a spectrum needs detected ions with a mass-to-charge ratio above 0, got none of {ions!r}")
+    return spectrum(ions, elements, ranges, abundances_of(options.isotope), **flight)

@@ -233,9 +233,8 @@ def settings_of(
                     break
             break
     else:
-        raise ValueError(
-            f"minutes must be at least {60 * (needs.hours or 0.0) / threads:.1f} for the smallest tip, got {minutes:g}"
-        )
+        least = math.ceil(600 * (needs.hours or 0.0) / threads) / 10  # 0.1 is not enough where 0.11 is needed
+        raise ValueError(f"minutes must be at least {least:g} for the smallest tip, got {minutes:g}")
     return StartSettings(
         text,
         indexing,

@@ -12,6 +12,7 @@ from apt_evap._common.files import FileError, TruncatedFile, open_for_reading, r
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_switch, short_text
 from apt_evap.detection.hits import Hits, Outcome
+from apt_evap.io._texts import foreign
 from apt_evap.warnings import DataWarning, warn
 
 MM = {"mm": 1.0, "cm": 10.0, "m": 1e3, "um": 1e-3}
@@ -140,7 +141,7 @@ def open_words(
     Raises
     ------
     FileError
-        If the file is missing, unreadable, empty or in the wrong byte order.
+        If the file is missing, unreadable, empty, of another kind by its first bytes, or in the wrong byte order.
     TruncatedFile
         If the size is not a multiple of `row_size` and `partial` is False.
     """
@@ -152,6 +153,9 @@ def open_words(
         size = os.fstat(file.fileno()).st_size
         if size == 0:
             raise FileError(f"{str(path)!r} is empty (0 bytes), expected {row_size} bytes per ion as in {kind}")
+        if other := foreign(file.read(64)):
+            raise FileError(f"{str(path)!r} is {other}, expected {row_size} bytes per ion as in {kind}")
+        file.seek(0)
         n, tail = divmod(size, row_size)
         if tail and not partial:
             raise _wrong_size(path, size, row_size, kind, rival)

@@ -82,6 +82,8 @@ def read_table(path: AnyPath, what: str, at_most: int) -> Table:
         If the file cannot be read, has no row of numbers, or a line has more or fewer cells than the others.
     """
     text = read_text(path, what, at_most)
+    if "\0" in text:
+        raise FileError(f"{str(path)!r} is not a text: it has zero bytes, expected {what}")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip(" ;,\t")]
     comments = [line.lstrip()[1:] for _, line in lines if line.lstrip().startswith("#")]
     lines = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]

@@ -104,6 +104,21 @@ def _compression(head):
     return next((name for magic, name in _MAGIC.items() if head.startswith(magic)), "")
 
 
+def foreign(head: bytes) -> str:
+    """What a file is that begins like no file of numbers: compressed, a page or a pointer; "" for any other."""
+    kind = _compression(head)
+    # numbers may begin with the two or three bytes of these
+    sure = {"gzip": head[2:3] == b"\x08" and head[3:4] < b" ", "bzip2": head[4:10] == b"1AY&SY"}
+    if kind and sure.get(kind, True):
+        return f"compressed by {kind}: decompress it"
+    text = head.lstrip().lower()
+    if text.startswith((b"<!doctype html", b"<html")):
+        return "a page of the web: download the file itself"
+    if text.startswith(b"version https://git-lfs"):
+        return "a pointer of Git LFS: git lfs pull gets the file itself"
+    return ""
+
+
 def is_compressed(path: AnyPath) -> bool:
     """Whether a file begins like a compressed one."""
     with open_for_reading(path) as file:
@@ -361,6 +376,31 @@ def composition_of(species: Mapping[str, int], low: float, high: float) -> tuple
     return atoms, formula(named)
 
 
+_CHARGE_SIGNS = str.maketrans("⁺¹²³⁴", "+1234")
+
+
+def ion_of_name(name: str, low: float, high: float) -> str:
+    """Formula in the name of a range, without a charge such as that of "AlO+", "Al++" or "Al2+"; "" for none.
+
+    Digits before the sign are those of the formula or of the charge, whichever gives a mass within the range.
+    """
+    if atoms_of(name):
+        return name
+    match = re.fullmatch(r"(.*?)([1-4]?)(\++)([1-4]?)", name.translate(_CHARGE_SIGNS).replace("^", "").replace(" ", ""))
+    if match is None:
+        return ""
+    formula, before, signs, after = match.groups()
+    ways = [(formula, int(before or len(signs)))] if not after else []
+    if before or after:
+        ways.append((formula + before, int(after or len(signs))))
+    for ion, charge in ways:
+        parts = [(element, digits, 1) for element, digits in _parts(ion)] if atoms_of(ion) else []
+        usual = {k for k, (element, digits, _) in enumerate(parts) if digits and _is_usual_isotope(element, digits)}
+        if parts and any(_fits(parts, isotopes, low, high, (charge,)) for isotopes in (set(), usual)):
+            return ion
+    return ""
+
+
 _MOST_DOUBTFUL = 8  # numbers of one range that may be those of isotopes: all 256 choices are compared
 _CHARGES = range(1, 5)
 _NEAR = 0.1  # [Da]: masses of isotopes differ from integers by up to 0.1
@@ -371,7 +411,7 @@ def _is_usual_isotope(element, digits):
     return element != "H" and (int(digits) in natural or not natural)
 
 
-def _fits(parts, isotopes, low, high):
+def _fits(parts, isotopes, low, high, charges=_CHARGES):
     """Whether an ion of these parts, some of which are isotopes, may have a mass over charge state in the range."""
     lightest = heaviest = 0.0
     for k, (name, digits, n) in enumerate(parts):
@@ -384,7 +424,7 @@ def _fits(parts, isotopes, low, high):
         else:
             return False
         lightest, heaviest = lightest + n * min(masses), heaviest + n * max(masses)
-    return any(lightest / charge - _NEAR < high and heaviest / charge + _NEAR > low for charge in _CHARGES)
+    return any(lightest / charge - _NEAR < high and heaviest / charge + _NEAR > low for charge in charges)
 
 
 def species_name(word: str, known: Collection[str], where: str) -> str:

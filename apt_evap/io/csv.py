@@ -33,20 +33,21 @@ _INTEGERS = ("pulses", "multiplicity", "pulse_id", "site", "ion", "outcome")
 _NAMES = {
     "x": ["detector_x", "det_x", "x_det", "xdet", "detx", "detectorx"],
     "y": ["detector_y", "det_y", "y_det", "ydet", "dety", "detectory"],
-    "time_of_flight": ["tof", "t", "time of flight"],
-    "voltage": ["v", "vdc", "v_dc", "dc_voltage", "standing_voltage", "high_voltage", "dc voltage"],
-    "pulse_voltage": ["vp", "v_p", "vpulse", "pulse_v", "pulse voltage"],
+    "time_of_flight": ["tof", "t"],
+    "voltage": ["v", "vdc", "v_dc", "dc_voltage", "standing_voltage", "high_voltage"],
+    "pulse_voltage": ["vp", "v_p", "vpulse", "pulse_v"],
     "mass_to_charge": [
         "m/n",
         "m/z",
         "m/q",
         "m/c",
+        "m",
         "m_n",
         "m_z",
         "mc",
         "mass",
-        "mass-to-charge",
-        "mass to charge",
+        "mass_to_charge_ratio",
+        "mass_to_charge_state_ratio",
         "da",
     ],
     "position_x": ["pos_x"],
@@ -63,13 +64,14 @@ _FACTORS = {
     "V": {"v": 1.0, "kv": 1e3, "mv": 1e-3},
     "Da": {"da": 1.0, "u": 1.0, "amu": 1.0},
 }
+_ALL_UNITS = {unit for factors in _FACTORS.values() for unit in factors}
 
 
 def read_csv(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     """Read ions from a text table: a .csv of `write`, or one of another program.
 
     Commas, semicolons, tabs or spaces divide the columns; where commas do not, they are decimal commas. The first line,
-    or a comment just before the numbers, names the columns, with units in brackets such as "x [mm]" or "m/n (Da)". With
+    or a comment just before the numbers, names the columns, with units such as "x [mm]", "m/n (Da)" or "tof_ns". With
     x, y and z, these are positions [nm]; x and y alone are detector coordinates [mm]. Four columns without names are x,
     y, z [nm] and m/n [Da]. Other columns become further columns with their names.
 
@@ -92,7 +94,7 @@ def read_csv(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     """
     table = read_table(path, "a table of ions", _LARGEST)
     known = {*_KNOWN, *_INTEGERS, "z"}
-    in_comment = table.comment and all(_split(word)[0].casefold() in known for word in table.comment)
+    in_comment = table.comment and all(_plain(_split(word)[0]) in known for word in table.comment)
     titles = table.names or (table.comment if in_comment else ["x", "y", "z", "m/n"])
     if len(titles) != len(table.rows[0]):
         raise FileError(
@@ -100,7 +102,7 @@ def read_csv(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
             f"four columns without names are x, y, z [nm] and m/n [Da], got {len(table.rows[0])} columns"
         )
     split = [_split(title) for title in titles]
-    plain = [name.casefold() for name, _ in split]
+    plain = [_plain(name) for name, _ in split]
     spatial = "z" in plain and "position_z" not in plain
     read: dict[str, Any] = {}
     units: dict[str, str] = {}
@@ -122,9 +124,18 @@ def read_csv(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
 
 
 def _split(title):
-    """Name and unit of "x [mm]", "x (nm)" or "x"."""
+    """Name and unit of "x [mm]", "x (nm)", "x", or of a known name such as "XDet_mm"."""
     match = re.fullmatch(r"(.*?)\s*[\[(]([^\])]*)[\])]", title.strip())
+    if match is None:
+        match = re.fullmatch(r"(.+)[_ ]([^_ ]+)", title.strip())
+        if match and not (_plain(match[1]) in {*_KNOWN, "z"} and match[2].casefold() in _ALL_UNITS):
+            match = None
     return (match[1].strip() or title.strip(), match[2].strip()) if match else (title.strip(), "")
+
+
+def _plain(name):
+    """The name in lower case, with underscores: blanks and hyphens divide words, too."""
+    return re.sub(r"[\s_-]+", "_", name.strip().casefold())
 
 
 def _values(table, index, column, unit, units):

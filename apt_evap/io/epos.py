@@ -181,8 +181,9 @@ class _Survey:
             if name not in self.present and (values[:64].any() or values.any()):
                 self.present.add(name)
             if name in ("voltage", "pulse_voltage"):
-                # fmax ignores NaN
-                self.highest[name] = np.fmax(self.highest.get(name, np.nan), np.fmax.reduce(values))
+                # fmax ignores NaN; some files have negative voltages
+                extremes = np.abs([np.fmax.reduce(values), np.fmin.reduce(values)])
+                self.highest[name] = np.fmax(self.highest.get(name, np.nan), np.fmax.reduce(extremes))
         if "ions" in block:
             self._pulses.add(block["ions"])
             self._every.add(block["ions"])
@@ -273,7 +274,8 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     ]
     chosen = choose(path, hits, columns)
     highest = next(
-        (v[chosen].max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()), np.nan
+        (np.abs(v[chosen]).max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()),
+        np.nan,
     )
     if highest < _LEAST:
         warn(

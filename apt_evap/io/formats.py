@@ -95,7 +95,8 @@ def _write_pyccapt(path, hits):
 _GROUPING = ("pulse_id", "multiplicity")
 _OF_PYCCAPT = (*EPOS, *_GROUPING, "start_counter", "laser_pulse", "calibrated_time_of_flight")
 _OF_PYCCAPT += ("uncalibrated_mass_to_charge", "multi")
-_WIDEST = 500.0  # [mm]: of a detector; those of atom probes have 80 to 120
+_WIDEST, _NARROWEST = 500.0, 1.0  # [mm]: of a detector; those of atom probes have 80 to 120
+_ENOUGH = 100  # ions: fewer may be near each other
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
     Format(".h5", _HDF5, _read_hdf5, _write_pyccapt, None, EPOS, lambda name, _: name in _OF_PYCCAPT),
@@ -203,7 +204,7 @@ def _with_warning_of_size(path, parts):
 
 
 def _warn_of_size(path, content):
-    """Warn if a measured map or ions are farther apart than any detector is wide."""
+    """Warn if a measured map or ions are farther apart than any detector is wide, or nearer than any is small."""
     if isinstance(content, Hits) and content.outcome is None and content.x is not None and content.y is not None:
         size = _size(content, np.isfinite(content.x) & np.isfinite(content.y))
         if max(size) > _WIDEST:  # perhaps by strays alone, which have a warning of their own
@@ -213,6 +214,13 @@ def _warn_of_size(path, content):
         size = (x_max - x_min, y_max - y_min)
     else:
         return False
+    if 0 < max(size) < _NARROWEST and (not isinstance(content, Hits) or len(content) >= _ENOUGH):
+        warn(
+            f"{str(path)!r} has detector coordinates in {size[0]:.4g} x {size[1]:.4g} mm, no detector is narrower than "
+            f"{_NARROWEST:g} mm: are they in mm?",
+            DataWarning,
+        )
+        return True
     if max(size) > _WIDEST:
         warn(
             f"{str(path)!r} has detector coordinates in {size[0]:.4g} x {size[1]:.4g} mm, no detector is wider than "

@@ -239,7 +239,8 @@ class MeasuredFile:
                 if ion.formula == self.peaks and ion.intervals
             )
             change = "--all-ions, --mass or --species change it"
-            note(f"{len(inside):,} of {len(hits):,} ions are used, those of {intervals}; {change}")
+            used, all_ions = (int(np.count_nonzero(ions.detected)) for ions in (inside, hits))  # without strays
+            note(f"{used:,} of {all_ions:,} ions are used, those of {intervals}; {change}")
             if named.flight is not None and named.flight.peaks:
                 note(f"{named.flight}")
         return inside

@@ -16,6 +16,7 @@ from apt_evap.io._texts import (
     atoms_of,
     check_bounds,
     composition_of,
+    ion_of_name,
     isotope_masses,
     number,
     read_text,
@@ -153,6 +154,8 @@ def _range(text, ions, odd, at):
             colour = colour.replace("##", "#")
         elif word == "name":
             name = value
+        elif word == "charge":
+            continue
         elif re.fullmatch(r"[0-9]{1,4}([.,]0{0,6})?", value):
             ion = species_name(key, ions, where)
             if ion not in ions and not atoms_of(ion):
@@ -168,8 +171,8 @@ def _range(text, ions, odd, at):
     species = {ion: count for ion, count in species.items() if count}
     if not (name or species):
         raise FileError(f"{where}: expected an element such as Si:1, or Name:..., got {text!r:.60}")
-    if not species and atoms_of(name):
-        species = {name: 1}
+    if not species and (ion := ion_of_name(name, low, high)):
+        species = {ion: 1}
     composition, formula = composition_of(species, low, high)
     return name or formula, low, high, volume or np.nan, colour, composition, species
 

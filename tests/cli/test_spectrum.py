@@ -54,6 +54,17 @@ def test_peaks_are_named_drawn_and_saved(alloy, tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("mass", [0.0, np.nan])
+def test_ions_without_a_mass_have_no_spectrum(tmp_path, capsys, monkeypatch, mass):
+    monkeypatch.chdir(tmp_path)
+    np.tile(np.array([1, 2, 3, mass], ">f4"), (300, 1)).tofile("a.pos")
+    for command in ("spectrum", "composition"):
+        assert main([command, "a.pos"]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and "needs detected ions with a mass-to-charge ratio above 0, got none of <Hits: 300" in err
+    assert [path.name for path in tmp_path.iterdir()] == ["a.pos"]
+
+
 def test_ranges_of_a_file_are_drawn_and_counted(alloy, tmp_path, capsys):
     names = {"Ni": (57.0, 61.5), "Al": (26.5, 27.5)}
     low, high = np.array(list(names.values())).T

@@ -1,5 +1,10 @@
 """Files that are damaged or odd: one sentence with the file and the line, or what is right with a warning."""
 
+import bz2
+import gzip
+import lzma
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -40,6 +45,54 @@ def test_pulse_numbers_of_others(tmp_path, numbers, pulses, ions, warning):
     assert (hits.pulse_id is None) == (pulses is None)
     if pulses is not None:
         assert hits.pulse_id.tolist() == pulses and hits.multiplicity.tolist() == ions
+
+
+IONS = ae.Hits(
+    x=np.linspace(-30, 30, 200), y=np.linspace(20, -20, 200), mass_to_charge=np.full(200, 28.0),
+    voltage=np.linspace(4000, 5000, 200), positions=np.random.default_rng(1).random((200, 3)),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("wrap", "what"),
+    [
+        (gzip.compress, "is compressed by gzip: decompress it"),
+        (bz2.compress, "is compressed by bzip2: decompress it"),
+        (lzma.compress, "is compressed by xz: decompress it"),
+        (lambda data: b"<!DOCTYPE html>\n<html>404</html>", "is a page of the web"),
+        (lambda data: b"version https://git-lfs.github.com/spec/v1\noid sha256:4d\n", "is a pointer of Git LFS"),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".pos", ".epos", ".raw"])
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_what_is_no_file_of_ions_says_what_it_is(tmp_path, suffix, wrap, what):
+    path = tmp_path / f"a{suffix}"
+    ae.write(tmp_path / "ions.epos", IONS)
+    path.write_bytes(wrap((tmp_path / "ions.epos").read_bytes()))
+    with pytest.raises(ae.FileError, match=f"a{suffix}' {what}"):
+        ae.read(path, partial=True)
+
+
+def test_numbers_that_begin_like_a_compression_are_read(tmp_path):
+    rows = np.full((3, 8), 5.0, "<f4")
+    rows[0, 0] = np.array([0x459C8B1F], "<u4").view("<f4")[0]  # 5,009 V, the bytes 1f 8b 9c 45
+    rows.tofile(tmp_path / "a.raw")
+    assert ae.read(tmp_path / "a.raw", columns="voltage").voltage[0] == rows[0, 0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_negative_voltages_are_not_those_of_kilovolts(tmp_path):
+    pulses = {"pulse_id": np.arange(200), "multiplicity": np.ones(200, int)}
+    ae.write(tmp_path / "a.epos", replace(IONS, voltage=-IONS.voltage, **pulses))
+    assert ae.read(tmp_path / "a.epos").voltage.max() == -4000
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+@pytest.mark.filterwarnings("ignore:.*is without the columns")
+def test_coordinates_in_other_units_are_doubted(tmp_path, factor):
+    ae.write(tmp_path / "a.csv", replace(IONS, x=IONS.x * factor, y=IONS.y * factor))
+    with pytest.warns(DataWarning, match="are they in mm?"):
+        ae.read(tmp_path / "a.csv")
 
 
 def test_chunks_name_the_format_that_was_given(tmp_path):

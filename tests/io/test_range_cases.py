@@ -142,6 +142,27 @@ def test_rows_with_numbers(save):
     assert strict(save(bare, ".rng")).low.tolist() == ranges.low.tolist()
 
 
+@pytest.mark.parametrize(
+    ("name", "low", "high", "atoms"),
+    [
+        ("AlO+", 42.9, 43.1, {"Al": 1, "O": 1}),
+        ("Al++", 13.4, 13.6, {"Al": 1}),
+        ("Al2+", 13.4, 13.6, {"Al": 1}),
+        ("Al2+", 53.8, 54.1, {"Al": 2}),
+        ("Al\u00b2\u207a", 13.4, 13.6, {"Al": 1}),
+        ("Al2O+2", 34.9, 35.1, {"Al": 2, "O": 1}),
+        ("Ti48 2+", 23.9, 24.1, {"Ti": 1}),
+        ("C60+", 719, 722, {"C": 60}),
+        ("Al2+", 90.0, 91.0, {}),  # no ion of this name has such a mass
+        ("Noise+", 13.4, 13.6, {}),
+    ],
+)
+def test_names_with_a_charge(save, name, low, high, atoms):
+    path = save(rrng(f"{low} {high} Vol:0 Name:{name} Color:FF0000", "26.9 27.1 Al:1 Charge:1", ions=("Al",)))
+    ranges = strict(path)
+    assert ranges.names[0] == name and ranges.composition == (atoms, {"Al": 1})
+
+
 def test_names_with_blanks(save):
     ranges = strict(save(rrng(
         "60.20 60.45 Vol:0.01801 Ta:1 Name:Ta three plus Color:336699",

@@ -28,6 +28,8 @@ def table(header, divider, comma=False, end="\n", rows=IONS):
         ("a.txt", table(["# x y z m_n, of a script"], "\t")),
         ("a.txt", table(["# made yesterday by someone"], "\t", comma=True)),
         ("a.txt", table([], " ", comma=True, end="\r")),
+        ("a.csv", table(["x,y,z,m"], ",", end="\r\n")),
+        ("a.txt", table(["X_nm\tY_nm\tZ_nm\tMass-to-charge-state ratio (Da)"], "\t")),
         ("a.csv", table(["x (A),y (A),z (A),mc"], ",", rows=[(*np.multiply(row[:3], 10), row[3]) for row in IONS])),
     ],
 )
@@ -37,6 +39,13 @@ def test_ions_of_other_programs(tmp_path, name, text):
     assert hits.mass_to_charge.tolist() == [row[3] for row in IONS]
     # units are factors of ten: one rounding
     np.testing.assert_allclose(hits.positions, [row[:3] for row in IONS], rtol=1e-14)
+
+
+def test_units_in_the_names_of_columns(tmp_path):
+    (tmp_path / "a.csv").write_text("XDet_mm,YDet_cm,Time of flight_us,Dose_nm\n1,2,0.5,7\n")
+    hits = read(tmp_path / "a.csv")
+    assert (hits.x.item(), hits.y.item(), hits.time_of_flight.item()) == (1.0, 20.0, 500.0)
+    assert list(hits.extra) == ["Dose_nm"]  # a name that is not known stays whole
 
 
 @pytest.mark.parametrize("dtype", ["f4", "f8"])
@@ -93,6 +102,7 @@ def test_forms_of_a_csv_that_are_wrong(tmp_path, options):
         ("a,b\n1,2\n", "has no column of ions such as x, y or m/n, only a, b"),
         ("1,2,3\n", "must name its columns in the first line.* got 3 columns"),
         ("x,y\n", "has no numbers"),
+        ("x,y\n1,\0\n", "is not a text: it has zero bytes"),
         ("x,X\n1,2\n", "different columns"),
     ],
 )
