@@ -17,7 +17,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
-from apt_evap.fit.start_settings import FIELD_FACTOR, FIELD_FACTORS, has_voltage, voltages_of
+from apt_evap.fit.start_settings import FIELD_FACTOR, FIELD_FACTORS, has_voltage, voltages_of, without_strays
 from apt_evap.maps.indexing.index_map import Candidate
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.indexing.refine import bins_of, refine, resolution
@@ -247,7 +247,9 @@ def constants_of(
         compression, error = length / scale, length / scale * (scale_error / scale)
         why = "proportional to the assumed flight length: the map fixes only their ratio"
         constants.append(Constant("image compression", compression, error, why))
-    if hits is None or (voltages := voltages_of(check_kind(hits, "hits", Hits, "Hits"))) is None:
+    if hits is not None:
+        hits = without_strays(check_kind(hits, "hits", Hits, "Hits"))
+    if hits is None or (voltages := voltages_of(hits)) is None:
         return Measurement(tuple(constants), tuple(checks), {})
     volume = 1 / atom_density(material.structure, material.a, material.c)
     factors = FIELD_FACTORS if field_factor is None else (factor, factor)

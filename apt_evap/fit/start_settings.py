@@ -208,7 +208,7 @@ def settings_of(
     """
     check_kind(indexing, "indexing", Indexing, "an Indexing, the result of index")
     if hits is not None:
-        check_kind(hits, "hits", Hits, "Hits")
+        hits = without_strays(check_kind(hits, "hits", Hits, "Hits"))
     if lens is not None:
         check_kind(lens, "lens", LocalElectrode, "a LocalElectrode")
         if field_factor is not None:
@@ -243,6 +243,14 @@ def settings_of(
         registration_start(best.projection.centre, best.projection.scale),
         needs,
     )
+
+
+def without_strays(hits: Hits) -> Hits:
+    """The ions but those far outside the field of view."""
+    if hits.outcome is not None or hits.x is None or hits.y is None:
+        return hits
+    kept = hits.detected | ~np.isfinite(hits.x) | ~np.isfinite(hits.y)
+    return hits if kept.all() else hits[kept]
 
 
 def voltages_of(hits: Hits | None) -> Floats | None:

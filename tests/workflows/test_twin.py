@@ -275,6 +275,29 @@ def test_a_twin_of_the_command_is_one_of_python(quick, capsys, tmp_path):
     assert quick == ["run", "index"]
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
+def test_a_twin_is_that_of_the_file_without_strays(quick, tmp_path, monkeypatch):
+    """Every tenth ion has a number for "no position", two are far away."""
+    ions = ae.read("ni.epos")
+    rows = np.union1d(np.arange(0, len(ions), 10), [1, 2])
+    x, y = ions.x.copy(), ions.y.copy()
+    x[rows], y[rows] = -90.0, -90.0
+    x[1], y[2] = 3e29, -700.0
+    kept = np.ones(len(ions), bool)
+    kept[rows] = False
+    files = {}
+    for name, measured in (("with", replace(ions, x=x, y=y)), ("without", ions[kept])):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        ae.write("ni.epos", measured)
+        assert main(["twin", "ni.epos", *ARGUMENTS, "--distance", "90", "-o", "t"]) == 0
+        settings = Path("t/specimen.toml").read_text().splitlines()
+        files[name] = [line for line in settings if not line.startswith("# SHA-256")]
+        files[name] += [Path("t", each).read_text() for each in ("start.json", "registration.json", "answer.txt")]
+    assert files["with"] == files["without"] and "radius at the first ions" in files["with"][-1]
+
+
 def test_ions_of_the_peaks_are_not_all_ions(quick, capsys):
     """The command selects those of the crystal, the function takes all; and off is not the same as not given."""
     source = measured_source(make_parser("twin").parse_args(["twin", "ni.epos", *ARGUMENTS]))
