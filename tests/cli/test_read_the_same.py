@@ -49,6 +49,22 @@ TOGETHER = [
     ["times.raw", "--distance", "90", "--t0", "3", "--element", "Ni", "--circle", "2.5"],
     ["ions.epos", "--ranges=-ranges.rrng", "--species", "Ni", "--ions", ",9000", "--undistort", "grid.csv"],
 ]
+ALL = ["--element", "Ni", "--all-ions"]
+FORMATS = [  # that have places on a detector
+    ["multiple.epos", *ALL, "--ions", "100,2500"],
+    ["semicolon.csv", *ALL, "--circle", "2.2,0.5,-0.25"],
+    ["tab.txt", *ALL, "--box", "-2.5,1,-1,2"],
+    ["comma.csv", *ALL, "--voltage", "4100.5,"],
+    ["pyccapt.h5", *ALL, "--mass", "20,40"],
+    ["ions.nxs", *ALL, "--undistort", "grid.csv"],
+]
+PLACELESS = [OPTIONS["byte_order"], ["ions.ato"], ["places.csv"], ["--format=.ato", "of_rouen"]]
+
+
+def pulses(numbers):
+    """Columns of the pulses of ions, by the number of each."""
+    _, rows, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    return {"pulse_id": rows, "multiplicity": counts[rows]}
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +89,20 @@ def files(tmp_path_factory):
         ae.write(folder / "volts.epos", replace(ions, voltage=volts / 100))
     ae.write(folder / "big.pos", ions)
     np.frombuffer((folder / "big.pos").read_bytes(), ">f4").astype("<f4").tofile(folder / "little.pos")
+    first = ions[:3000]
+    together = np.sort(random.integers(0, 2000, 3000))  # pulses of several ions
+    ae.write(folder / "multiple.epos", replace(first, **pulses(together)))
+    ae.write(folder / "semicolon.csv", replace(first, **pulses(together)), separator="semicolon")
+    ae.write(folder / "tab.csv", first, separator="tab", decimals=4)
+    (folder / "tab.csv").rename(folder / "tab.txt")
+    text = (folder / "semicolon.csv").read_text()
+    (folder / "comma.csv").write_text("\ufeff" + text.replace(".", ","), newline="\r\n")
+    ae.write(folder / "pyccapt.h5", first)
+    ae.write(folder / "ions.nxs", first, elements=("Ni",))
+    (folder / "places.csv").write_text("m/n (Da);X_nm;Y_nm;Z_nm\n28,97;1,5;2;3\n13,5;4;5,25;6\n")
+    table = np.hstack([10 * places, mass[:, None], np.zeros((N, 10))]).astype("<f4")
+    for name in ("ions.ato", "of_rouen"):
+        (folder / name).write_bytes(np.array([0, 3], "<u4").tobytes() + table.tobytes())
     rows = np.zeros((N, 8), "<f4")
     rows[:, 0], rows[:, 3], rows[:, 4] = volts, x, y
     rows[:, 5] = np.sqrt(mass * (90**2 + x**2 + y**2) / (1.92971e-4 * volts))
@@ -114,7 +144,7 @@ def test_every_option_of_reading_is_here():
 
 CASES = [
     pytest.param(words, id=" ".join(words), marks=[pytest.mark.slow] if "3" in words else [])  # fits the flight
-    for words in (*OPTIONS.values(), *TOGETHER)
+    for words in (*OPTIONS.values(), *TOGETHER, *FORMATS)
     if words[0] != "little.pos"  # no places on a detector
 ]
 
@@ -151,12 +181,22 @@ def test_the_command_of_a_twin_reconstructs_its_ions(folder, words, monkeypatch,
     assert same(file_of(again).select(read(again), note), twin.measured)
 
 
-def test_ions_without_places_and_maps_are_read_from_what_is_printed(folder):
-    file = file_of(parsed("info", *OPTIONS["byte_order"]))
+def test_pulses_of_several_ions_are_those_that_were_written(folder):
+    first, second = ae.read("multiple.epos"), ae.read("semicolon.csv")
+    assert same(first, second) and "multiplicity" in first.columns and first.multiplicity.max() > 3
+
+
+@pytest.mark.parametrize("words", PLACELESS, ids=" ".join)
+def test_ions_without_places_are_read_from_what_is_printed(folder, words):
+    file = file_of(parsed("info", *words))
     hits = file.load(ae.read)
     assert same(eval(file.code(hits.columns), {"ae": ae}), hits)
     assert same(read(parsed("info", *file.words())), hits)
-    assert same(hits, ae.read("big.pos"))
+    if words[0] == "little.pos":
+        assert same(hits, ae.read("big.pos"))
+
+
+def test_maps_are_read_from_what_is_printed(folder):
     words = ["map.npz", "--arrays", "v,x,y", "--unit", "cm"]
     explorer, view = explorer_and_view(parsed("explore", *words))
     again, _ = explorer_and_view(make_parser().parse_args(["explore", *shlex.split(explorer.commands(view).shell)[2:]]))
