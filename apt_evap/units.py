@@ -5,7 +5,8 @@ Values from CODATA 2018 (Tiesinga et al., Rev. Mod. Phys. 93, 025010, 2021).
 
 import math
 
-from apt_evap._common.types import Floats
+import numpy as np
+from numpy.typing import NDArray
 
 ELEMENTARY_CHARGE = 1.602176634e-19
 """Elementary charge [C]."""
@@ -28,7 +29,7 @@ FLIGHT_TIME = math.sqrt(2.0) / SPEED
 """[ns sqrt(V) / nm / sqrt(Da)]: converts the reduced time of a flight (m = charge state = e = 1) to ns."""
 
 
-def speed_from_energy(energy: Floats | float, mass: Floats | float) -> Floats:
+def speed_from_energy(energy: NDArray[np.float64] | float, mass: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """Speed of an ion from its kinetic energy, v = sqrt(2 E / m).
 
     Parameters

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from importlib import import_module
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -100,7 +99,7 @@ class Hits:
     source : str
         File name, or origin of the ions.
     ranges : Ranges, optional
-        Ranges of mass that belong to the ions, for `composition`. Selections keep them.
+        Ranges of mass that belong to the ions, such as for `spectrum`. Selections keep them.
     extent : tuple of float, optional
         Area of the detector of a run: x_min, x_max, y_min, y_max [mm]. None for measured ions, for a selection of the
         ions, and for ions with changed coordinates (use ``extent=None`` with the new x and y in `dataclasses.replace`).
@@ -298,37 +297,6 @@ class Hits:
         time, _, x, y = self.require("time_of_flight", "voltage", "x", "y")
         time_zero = check_number(time_zero, "time_zero", unit="ns")
         return replace(self, mass_to_charge=mass_to_charge(self.total_voltage, time - time_zero, x, y, distance))
-
-    def composition(self, elements: str | Sequence[str] | None = None) -> Any:
-        """Composition in at.%, with errors and what is unexplained; that of `apt_evap.spectrum`.
-
-        Parameters
-        ----------
-        elements : str or sequence of str, optional
-            Elements and ions that are expected. By default the ions of the ranges, if the ions have any, and else all
-            elements are tried.
-
-        Returns
-        -------
-        Composition
-
-        Raises
-        ------
-        ValueError
-            If there is no mass_to_charge, or an element is unknown.
-
-        Examples
-        --------
-        >>> rng = np.random.default_rng(1)
-        >>> mass = rng.choice([62.93, 64.93], 5000, p=[0.69, 0.31]) * rng.normal(1, 5e-4, 5000)
-        >>> ae.Hits(mass_to_charge=mass).composition("Cu").at_percent
-        {'Cu': 100.0}
-        """
-        self.require("mass_to_charge")
-        # spectra are on a layer above the ions: their module is loaded by its name when it is needed
-        spectrum = import_module("apt_evap.spectra.mass_spectrum").spectrum
-        ranges = self.ranges if elements is None else None
-        return spectrum(self, elements, ranges).composition
 
     def correlation(self) -> Correlation:
         """Pairs of detected ions of one pulse, and the numbers of pulses with one, two and more ions.

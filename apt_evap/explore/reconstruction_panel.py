@@ -28,7 +28,6 @@ from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.specimen_view import SIDES, SpecimenView, pixel_color
 from apt_evap.explore.widgets import color_bar, show_extent, square
 from apt_evap.io.formats import read_ranges
-from apt_evap.measures.point_cloud import PointCloud
 from apt_evap.reconstruction.assumed_constants import STARTS, assumptions
 from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
@@ -74,7 +73,7 @@ class ReconstructionPanel:
         self._material, self._later = material, later
         self.result: Reconstruction | None = None
         """The last reconstruction."""
-        self.cloud: PointCloud | None = None
+        self.cloud: Any = None
         """Its ions and species."""
         self._make_constants()
         self._make_views()
@@ -146,7 +145,7 @@ class ReconstructionPanel:
             hits, constants, ranges = self._of_run() if self._explorer.run is not None else self._of_measured(typed)
             more = {"ranges": ranges, "solutes": solutes} if shape == "evolving" else {}
             result = reconstruct(hits, shape=shape, **more, **constants)
-            cloud = PointCloud.of(result.to_hits("specimen"), ranges)
+            cloud = result.cloud(ranges, "specimen")
             named = () if self._explorer.run is not None else [name for name in _ASSUMED if name not in typed]
             told = [] if len(result) < 2 else list(map(str, assumptions(result, named)))
             self._later(partial(self._put, result, cloud, told), 0)

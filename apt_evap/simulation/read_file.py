@@ -33,7 +33,7 @@ def read(
     columns : sequence of str, optional
         Names of the columns to read; only these are kept in memory. All by default. Not for a run, an .npz and TAPSim.
     ranges : str, path-like or Ranges, optional
-        Ranges of mass of the ions, or a file of these, for `Hits.composition`.
+        Ranges of mass of the ions, or a file of these; the result has them as `Hits.ranges`.
     **options
         Options of the reader of the format: ``partial=True`` reads the complete ions of a truncated file (the complete
         sections of an .apt), ``byte_order="little"`` a .pos or .epos in the wrong byte

@@ -24,11 +24,13 @@ def package_of(module):
 
 @cache  # the copies of the package differ in one file
 def imports(source, package):
-    """Dotted names, without "apt_evap.", that a Python source imports, wherever it does: also for type hints only."""
+    """Dotted names, without "apt_evap.", that a Python source imports, wherever it does, by name or for type hints too."""
     found = []
     for node in ast.walk(ast.parse(source)):
         names = []
-        if isinstance(node, ast.Import):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            names = [item.value for item in node.args if isinstance(item, ast.Constant)]
+        elif isinstance(node, ast.Import):
             names = [item.name for item in node.names]
         elif isinstance(node, ast.ImportFrom):
             inner = [*package[: len(package) - node.level + 1]] if node.level else []
@@ -126,6 +128,7 @@ def copy_of(package, target):
             "if TYPE_CHECKING:\n    from apt_evap.simulation.run import Run",
             "modules",
         ),
+        ("detection/hits.py", 'import_module("apt_evap.spectra.mass_spectrum")', "modules"),
         ("io/hdf5.py", "def f():\n    from apt_evap.simulation.run import load", "packages"),
     ],
 )
