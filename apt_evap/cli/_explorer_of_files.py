@@ -13,7 +13,6 @@ from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.measured_ions import MeasuredIons
@@ -106,8 +105,8 @@ def _recommended(path):
         if (settings := _settings_beside(path)) is None:
             return None
         for panel in read_config(settings).maps.panels:
-            if not isinstance(panel.perturbation, Unperturbed):
-                values_of(panel.perturbation)
+            mechanism, _ = values_of(panel.perturbation)
+            if mechanism != "unperturbed":
                 return panel.perturbation
     except (ValueError, OSError):  # changed by hand: the run is shown without it
         return None

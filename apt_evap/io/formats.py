@@ -5,7 +5,7 @@ A new format needs one module with a reader, a writer or both, and one line in `
 
 import inspect
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -125,7 +125,14 @@ _ADVICE |= {
 }
 
 
-def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | None = None, **options: Any) -> Any:
+def read(
+    path: AnyPath,
+    *,
+    format: str | None = None,
+    columns: Sequence[str] | None = None,
+    ranges: AnyPath | Ranges | None = None,
+    **options: Any,
+) -> Any:
     """Read a file of ions or a map; `simulation.read_file.read` reads runs, too.
 
     Parameters
@@ -136,6 +143,8 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
         Suffix of the format, such as ".pos", for any name of the file.
     columns : sequence of str, optional
         Names of the columns to read.
+    ranges : str, path-like or Ranges, optional
+        Ranges of mass of the ions, or a file of these.
     **options
         Options of the reader of the format.
 
@@ -154,7 +163,11 @@ def read(path: AnyPath, *, format: str | None = None, columns: Sequence[str] | N
     assert chosen.read is not None
     content = chosen.read(path, **_options(path, chosen, chosen.read, columns, options))
     _warn_of_size(path, content)
-    return content
+    if ranges is None:
+        return content
+    if not isinstance(content, Hits):
+        raise FileError(f"{str(path)!r}: ranges are for ions with m/n, got {content!r}")
+    return replace(content, ranges=ranges if isinstance(ranges, Ranges) else read_ranges(ranges))
 
 
 def chunks(

@@ -1,17 +1,14 @@
 """Reading of a file of any kind: a run, ions or a map."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
-from apt_evap.detection.hits import Hits
 from apt_evap.io import formats
 from apt_evap.simulation.run import load
 from apt_evap.simulation.run_hdf5 import is_run
-from apt_evap.spectra.mass_ranges import Ranges
 
 
 def read(
@@ -19,7 +16,7 @@ def read(
     *,
     format: str | None = None,
     columns: Sequence[str] | None = None,
-    ranges: AnyPath | Ranges | None = None,
+    ranges: Any = None,
     **options: Any,
 ) -> Any:
     """Read a file of ions, a run or a map. The format is recognised by the first bytes if possible, or by the suffix.
@@ -63,12 +60,7 @@ def read(
     array([29., 29., 58.], dtype=float32)
     """
     if formats.format_of(path, format).suffix != ".h5" or not is_run(path):
-        content = formats.read(path, format=format, columns=columns, **options)
-        if ranges is None:
-            return content
-        if not isinstance(content, Hits):
-            raise FileError(f"{str(path)!r}: ranges are for ions with m/n, got {content!r}")
-        return replace(content, ranges=ranges if isinstance(ranges, Ranges) else formats.read_ranges(ranges))
+        return formats.read(path, format=format, columns=columns, ranges=ranges, **options)
     name = str(check_path(path))
     for option in options:
         raise FileError(f"{name!r}: reading .h5 files takes no options, got {option!r}")

@@ -24,7 +24,7 @@ def package_of(module):
 
 @cache  # the copies of the package differ in one file
 def imports(source, package):
-    """Dotted names, without "apt_evap.", that a Python source imports, wherever it does, by name or for type hints too."""
+    """Dotted names, without "apt_evap.", that a source imports, wherever it does: also by name, or for type hints."""
     found = []
     for node in ast.walk(ast.parse(source)):
         names = []
