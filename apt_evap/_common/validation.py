@@ -74,10 +74,6 @@ def check_array(
     finite : bool
         Whether NaN and infinities are errors.
 
-    Returns
-    -------
-    ndarray
-
     Raises
     ------
     ValueError

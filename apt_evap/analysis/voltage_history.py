@@ -81,10 +81,6 @@ def smoothed_history(values: ArrayLike, points: int = 200) -> SmoothedHistory:
     points : int
         Number of sections k; n if there are fewer values.
 
-    Returns
-    -------
-    SmoothedHistory
-
     Raises
     ------
     ValueError

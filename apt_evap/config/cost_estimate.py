@@ -63,10 +63,6 @@ def estimate_cost(config: Config, threads: int) -> CostEstimate:
         The settings.
     threads : int
         Threads of the run.
-
-    Returns
-    -------
-    CostEstimate
     """
     try:
         atoms, surface = estimated_atoms(**config.tip)

@@ -18,10 +18,6 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
         Fields of `LocalElectrode`, perhaps with a ``preset`` whose other fields they replace. As text: the name of a
         preset and the fields that are changed, ``"local-electrode:shank_angle=7,distance=60e3"``.
 
-    Returns
-    -------
-    LocalElectrode
-
     Raises
     ------
     ValueError

@@ -24,10 +24,6 @@ def read_material(text: str, name: str = "material") -> Material:
     name : str
         Name of the argument, for the message.
 
-    Returns
-    -------
-    Material
-
     Raises
     ------
     ValueError

@@ -21,10 +21,6 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
         ``"RollUp:0.3,0.1"`` for mean and standard deviation [eV], ``"Combined:0.3,0.1,0.75"`` with the rollup_fraction
         at the end, or the table in TOML syntax.
 
-    Returns
-    -------
-    perturbation
-
     Raises
     ------
     ValueError

@@ -112,10 +112,6 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
     own_classes : bool
         Whether modules with classes of one's own are imported, as in `read_config`.
 
-    Returns
-    -------
-    Config
-
     Raises
     ------
     FileError

@@ -95,10 +95,6 @@ def doubt_of_cap(radius: float, apex_radius: float | None) -> str:
         That of the cap [nm]; NaN if there is none.
     apex_radius : float or None
         That of the tip [nm], if it is known.
-
-    Returns
-    -------
-    str
     """
     if math.isnan(radius):
         return (

@@ -169,10 +169,6 @@ def register_near(hits: Hits, measured: DetectorMap, bounds: dict[str, Any]) -> 
     bounds : dict
         Result of `registration_start` or `indexed_start`.
 
-    Returns
-    -------
-    Registration
-
     Raises
     ------
     ValueError

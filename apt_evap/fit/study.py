@@ -410,10 +410,6 @@ def bounded_text(
         Its lower and upper bound, and whether each of them is at an end of the grid.
     factor : float
         Of all numbers.
-
-    Returns
-    -------
-    str
     """
     if interval is None or interval[0] == interval[1]:  # not known, or given
         return f"{value * factor:.3g}"

@@ -90,10 +90,6 @@ def add_colorbar(
         Axes that give space to the bar.
     label : str
         Quantity of the colours, with its unit.
-
-    Returns
-    -------
-    matplotlib.colorbar.Colorbar
     """
     low, high = images[0].get_clim()
     below = min(np.nanmin(image.get_array()) for image in images) < low

@@ -199,10 +199,6 @@ def binned(hits: Hits, bins: int | None = None, smoothing: float | None = None) 
         Standard deviation of the Gaussian [mm]. By default one bin; without `bins` a bin of about one ion, if that is
         larger, but at most 1/32 of the longer side: few ions are in smaller bins, not smoothed less.
 
-    Returns
-    -------
-    DetectorMap
-
     Examples
     --------
     >>> places = np.random.default_rng(1).uniform(-20, 20, (2, 3000))  # mm

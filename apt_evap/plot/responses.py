@@ -26,10 +26,6 @@ def ion_colors(n: int) -> list[str]:
     ----------
     n : int
         Number of ions.
-
-    Returns
-    -------
-    list of str
     """
     return [f"C{index % 10}" for index in range(n)]
 

@@ -263,10 +263,6 @@ def mark_atoms(
         As for the plot [degrees].
     size : float
         Diameter of the circles [points].
-
-    Returns
-    -------
-    matplotlib.axes.Axes
     """
     positions = check_array(positions, "positions", ("n", 3))
     right, up, _ = _viewed_from(elevation, azimuth)

@@ -58,10 +58,6 @@ def density_of(places: Floats, rim: float, widening: float, bins: int) -> CapDen
     bins : int
         Number of cells along the diameter.
 
-    Returns
-    -------
-    CapDensity
-
     Notes
     -----
     A cap that recedes by dz and widens by w dz sweeps the volume :math:`R^2 [\cos\theta - w (1-\cos\theta)] dz`

@@ -311,10 +311,6 @@ def errors_of(
         Group of each ion, shape (n,).
     below : ndarray or float
         Depth of each ion below the apex [nm], shape (n,), which the factor of the depth leaves as it is.
-
-    Returns
-    -------
-    ReconstructionErrors
     """
     free = free_constants(fit)
     n = len(positions)

@@ -366,10 +366,6 @@ def follow_surface(
     ranges, solutes, labels
         As for `reconstruct`.
 
-    Returns
-    -------
-    EvolvingReconstruction
-
     Raises
     ------
     ValueError

@@ -87,10 +87,6 @@ def found_tip(
         Crystal direction along the axis.
     radius : float
         Radius of the apex [nm].
-
-    Returns
-    -------
-    Tip
     """
     factor = radius / ions.radius
     parts = [Phase("matrix", crystal)]

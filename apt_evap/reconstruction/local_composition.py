@@ -77,10 +77,6 @@ def local_composition(
         Ions within the Gaussian: the variance of the composition is that of so many draws.
     volume : float
         Volume of the specimen per ion [nm^3].
-
-    Returns
-    -------
-    LocalComposition
     """
     choices = [halves, halves & solute, ~halves, ~halves & solute]
     ions, ours, others, theirs = _counted(positions, choices, neighbours, volume)
@@ -123,10 +119,6 @@ def solute_contrast(positions: Floats, solute: Booleans, halves: Booleans, volum
     ----------
     positions, solute, halves, volume
         As for `local_composition`.
-
-    Returns
-    -------
-    SoluteContrast
 
     Notes
     -----

@@ -94,10 +94,6 @@ def check_solutes(
     profiles : bool
         Whether a `Segregation` is possible.
 
-    Returns
-    -------
-    dict
-
     Raises
     ------
     ValueError

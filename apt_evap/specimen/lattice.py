@@ -65,10 +65,6 @@ def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
         Lattice constant [nm].
     c : float, optional
         Height of the hexagonal cell [nm]; only for hcp; sqrt(8/3) a by default.
-
-    Returns
-    -------
-    ndarray
     """
     if check_structure(structure) == "hcp":
         height = math.sqrt(8 / 3) * a if c is None else check_number(c, "c", above=0, unit="nm")

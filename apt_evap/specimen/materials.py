@@ -246,10 +246,6 @@ def as_material(value: Material | str | Mapping[str, Any], name: str = "material
     name : str
         Name of the argument, for the message.
 
-    Returns
-    -------
-    Material
-
     Raises
     ------
     ValueError

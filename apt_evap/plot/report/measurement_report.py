@@ -17,10 +17,6 @@ def measurement_section(constants: Sequence[Any], checks: Sequence[Any], command
         Command line that reconstructs with these constants.
     doubt : str
         Reason why constants are left out.
-
-    Returns
-    -------
-    str
     """
     rows = [(constant.name, constant.text, constant.depends) for constant in constants]
     parts = [table(rows, ("", "value", "known only together with"))] if rows else []

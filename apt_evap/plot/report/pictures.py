@@ -33,10 +33,6 @@ def blinking_pictures(
         Width of a picture [inch].
     crystal : tuple, optional
         Orientation of a crystal and its projection, whose poles are drawn on all maps.
-
-    Returns
-    -------
-    str
     """
     first = next(iter(maps.values()))
     rows, columns = (np.flatnonzero(first.mask.any(axis=axis)) for axis in (1, 0))

@@ -52,10 +52,6 @@ def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
         A batch of n.
     settings : ResponseSettings
         The launches that the responses cover.
-
-    Returns
-    -------
-    Scouts
     """
     corners = shares_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))  # of the places of a roll-up
     places = [emissions.positions[:, None], shared_positions(emissions, corners[None])]
