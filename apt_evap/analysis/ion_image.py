@@ -130,33 +130,6 @@ def tunnel_factor(field: ArrayLike, ionisation_energy: float) -> Any:
     return float(factors) if factors.ndim == 0 else factors
 
 
-def critical_distance(field: float, ionisation_energy: float, work_function: float = _WORK_FUNCTION) -> float:
-    """Critical distance (I - phi) / F of a plane surface.
-
-    Parameters
-    ----------
-    field : float
-        Field F [V/nm].
-    ionisation_energy : float
-        Ionisation energy I of the gas [eV].
-    work_function : float
-        Work function phi of the surface [eV].
-
-    Returns
-    -------
-    float
-        Distance [nm].
-
-    Examples
-    --------
-    >>> from apt_evap.analysis.ion_image import critical_distance
-    >>> round(critical_distance(44.0, 24.587), 2)
-    0.46
-    """
-    field = check_number(field, "field", above=0, unit="V/nm")
-    return _barrier(ionisation_energy, work_function) / field
-
-
 @dataclass(frozen=True, eq=False)
 class FieldIonImage:
     """Field-ion image: the spots of the n surface atoms that an image shows.

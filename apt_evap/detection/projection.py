@@ -191,8 +191,3 @@ class Projection:
         product = None if self.compression is None else self.compression * compression
         barrel = self.barrel / compression**2
         return replace(self, scale=self.scale / compression, compression=product, barrel=barrel)
-
-    def change_of_scale(self, radius: float) -> float:
-        """Relative change of the distance per angle from the centre to a radius [mm]: negative for a barrel."""
-        angle = float(angle_of(np.array(radius / self.scale), self.compression, self.barrel))
-        return radius / (self.scale * angle) - 1

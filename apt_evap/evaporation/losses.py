@@ -34,11 +34,6 @@ class Conditions(NamedTuple):
     """Measured fractions, shape (k, n, m)."""
 
     @property
-    def lost_in_total(self) -> Floats:
-        """Share of all ions that leave between pulses, shape (n, m)."""
-        return np.tensordot(self.composition, self.lost, axes=1)
-
-    @property
     def bias(self) -> Floats:
         """Measured minus true fraction, shape (k, n, m)."""
         return self.measured - self.composition[:, None, None]

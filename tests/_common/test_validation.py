@@ -35,7 +35,7 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.analysis.apex import field_factor
-from apt_evap.analysis.ion_image import critical_distance, tunnel_factor
+from apt_evap.analysis.ion_image import tunnel_factor
 from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 from apt_evap.config.cost_estimate import CostEstimate
 from apt_evap.config.simulation_file import read_config
@@ -593,11 +593,6 @@ CASES = [
         {"field": 44.0, "ionisation_energy": 24.6},
         "ionisation_energy",
         field=[0, -1.0, [1.0, 0.0], 10**400],
-    ),
-    row(
-        critical_distance,
-        {"field": 44.0, "ionisation_energy": 24.6},
-        "field ionisation_energy work_function",
     ),
     row(plane_normals, {"material": nickel, "planes": [(1, 1, 1)]}, name=None),
     row(direction_normals, {"material": nickel, "directions": [(1, 1, 1)]}, name=None),
