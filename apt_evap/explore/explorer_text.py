@@ -25,17 +25,7 @@ class ExplorerText:
         self._explorer = explorer
 
     def commands(self, settings: ExplorerSettings) -> Commands:
-        """Command line and Python lines that give the same maps.
-
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Settings of the maps.
-
-        Returns
-        -------
-        Commands
-        """
+        """Command line and Python lines that give the same maps."""
         # a picture of `map` is neither registered nor flattened
         one = self._explorer.measured is None or self._explorer.run is None
         command = "map" if one and not settings.flattening else "explore"
@@ -50,20 +40,10 @@ class ExplorerText:
         return Commands(shlex.join(shell), "\n".join([*self._python_hits(settings), *self._python_maps(settings)]))
 
     def selection(self, settings: ExplorerSettings, x: tuple[float, float], y: tuple[float, float]) -> Commands:
-        """Command line and Python lines that select the ions within a rectangle on the map.
+        """Command line and Python lines that select the ions within a rectangle with these bounds on the map [mm].
 
-        Parameters
-        ----------
-        settings : ExplorerSettings
-            Settings of the maps.
-        x, y : tuple of float
-            Bounds of the rectangle [mm].
-
-        Returns
-        -------
-        Commands
-            Of the measured ions if there are any, else of the run. `hits` are the simulated ions in both cases. An
-            empty command line for a measured map, which has no ions.
+        They are of the measured ions if there are any, else of the run. `hits` are the simulated ions in both cases. A
+        measured map, which has no ions, has an empty command line.
         """
         bounds = tuple(float(f"{value:.6g}") for value in (*sorted(x), *sorted(y)))
         box = f"--box={','.join(map(repr, bounds))}"

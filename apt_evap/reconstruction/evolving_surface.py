@@ -20,11 +20,8 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap._core.surface_map import place_ions
 from apt_evap.reconstruction.spherical_harmonics import Coefficients, SphericalTransform
 
-DEGREE = 44
-"""Largest degree of the surface."""
-CUTOFF = 16.0
-"""Degree at which the volume of ions is damped to exp(-1/2)."""
-
+_DEGREE = 44  # largest of the harmonics of the surface
+_CUTOFF = 16.0  # degree at which the volume of ions is damped to exp(-1/2)
 _RING = 0.82  # of the half angle of the field of view, from which the ring reaches to its rim
 _RING_MEMORY = 1 / 13  # of the radius: depth over which the flux of the ring is averaged, 1 nm of R = 13 nm
 _STEP = 1 / 130  # of the radius: largest depth of a step
@@ -153,10 +150,6 @@ class EvolvingSurface:
     ----------
     ions : IonSequence
         The ions.
-    degree : int
-        Largest degree of the harmonics.
-    cutoff : float
-        Degree at which the volume of the ions is damped to exp(-1/2).
 
     Notes
     -----
@@ -168,9 +161,9 @@ class EvolvingSurface:
     On a shank with w = dR/dz, R = R_0 + w z, and the sphere recedes by :math:`\cos\theta - w (1-\cos\theta)` per dz.
     """
 
-    def __init__(self, ions: IonSequence, degree: int = DEGREE, cutoff: float = CUTOFF) -> None:
+    def __init__(self, ions: IonSequence) -> None:
         self.ions = ions
-        self.transform = transform = SphericalTransform(degree)
+        self.transform = transform = SphericalTransform(_DEGREE)
         polar, azimuth = transform.polar[:, None], transform.azimuths[None, :]
         sines, cosines = np.sin(polar), np.cos(polar)
         # The pole of the grid is y, and the azimuth starts behind the specimen: the axis is in the middle of the grid.
@@ -187,7 +180,7 @@ class EvolvingSurface:
         self._near = 0.5 * (1 - np.tanh((angles - _FRAME_TO) / math.radians(4.0)))
         degrees = transform.degrees.astype(np.float64)
         self._transfer = transfer(degrees)
-        self._damping = np.exp(-0.5 * (degrees / cutoff) ** 2)
+        self._damping = np.exp(-0.5 * (degrees / _CUTOFF) ** 2)
         fastest = float((self._transfer * degrees * (degrees + 1) * self._damping).max())
         self.step = ions.radius * min(_FORGOTTEN / fastest, _STEP)
 

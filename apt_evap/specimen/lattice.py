@@ -123,7 +123,7 @@ def direction_vectors(structure: str, a: float, c: float | None = None) -> Float
     return np.array([[1.0, 0.0, 0.0], [-0.5, math.sqrt(3) / 2, 0.0], [0.0, 0.0, height]])
 
 
-def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tuple[int | float, ...]:
+def check_axis(structure: str, axis: Sequence[float]) -> tuple[int | float, ...]:
     """Return a crystal direction as a tuple of three numbers, or raise an error that names the argument.
 
     Parameters
@@ -132,8 +132,6 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
         One of fcc, bcc, sc, diamond, hcp.
     axis : sequence of float
         Direction [u v w], or for hcp [u v t w] with u + v + t = 0.
-    name : str
-        Name of the argument, for the message.
 
     Returns
     -------
@@ -147,22 +145,22 @@ def check_axis(structure: str, axis: Sequence[float], name: str = "axis") -> tup
     """
     four = structure == "hcp" and np.shape(axis) == (4,)
     try:
-        indices = check_array(axis, name, (4 if four else 3,), finite=False)
+        indices = check_array(axis, "axis", (4 if four else 3,), finite=False)
     except ValueError as error:
         more = ", or four such as [2, -1, -1, 0]" if structure == "hcp" else ""
-        raise ValueError(f"{name} must be three numbers such as [0, 1, 2]{more}, got {short_text(axis)}") from error
+        raise ValueError(f"axis must be three numbers such as [0, 1, 2]{more}, got {short_text(axis)}") from error
     if not np.isfinite(indices).all():
-        raise ValueError(f"{name} must be finite, got {short_text(axis)}")
+        raise ValueError(f"axis must be finite, got {short_text(axis)}")
     if four:
         u, v, t, w = indices
         # exactly for integers; otherwise to the rounding of a few decimals
         if abs(u + v + t) > (0 if (indices == np.rint(indices)).all() else 1e-6 * np.abs(indices).max()):
-            raise ValueError(f"{name} must have u + v + t = 0 for a direction [u v t w], got {short_text(axis)}")
+            raise ValueError(f"axis must have u + v + t = 0 for a direction [u v t w], got {short_text(axis)}")
         indices = np.array([u - t, v - t, w])
     if not indices.any():
-        raise ValueError(f"{name} must not be zero, got {short_text(axis)}")
+        raise ValueError(f"axis must not be zero, got {short_text(axis)}")
     if np.abs(indices).max() > 1e6 or np.abs(indices).max() < 1e-6:
-        raise ValueError(f"{name} must have its largest number between 1e-6 and 1e6, got {short_text(axis)}")
+        raise ValueError(f"axis must have its largest number between 1e-6 and 1e6, got {short_text(axis)}")
     if (indices == np.rint(indices)).all():
         whole = indices.astype(np.int64)
         return tuple((whole // np.gcd.reduce(whole)).tolist())
