@@ -118,7 +118,8 @@ class PolesOfRun:
         The place of the pole and the structure of the measured map are kept for all emissions.
         """
         measured: Any = maps.measured
-        if self._kept[0] is not measured or self._kept[1] != registration:
+        kept = self._kept  # another thread may replace it
+        if kept[0] is not measured or kept[1] != registration:
             measure = structure = None
             try:
                 measure = PoleMeasure(self._run, registration, measured)
@@ -126,6 +127,6 @@ class PolesOfRun:
                 pass
             else:
                 structure = measure.structure(measured)
-            self._kept = measured, registration, measure, structure
-        _, _, measure, structure = self._kept
+            self._kept = kept = measured, registration, measure, structure
+        _, _, measure, structure = kept
         return None if measure is None else measure.structure(maps.simulated), structure
