@@ -9,6 +9,7 @@ import apt_evap as ae
 from apt_evap.fit.radius import _fit
 
 ENERGY = ae.TruncatedNormal(0.1, 0.1)
+EMISSIONS = [ae.Unperturbed(), ae.RollUp(ENERGY, probability=0.5)]
 
 
 def members(random, radii, values=9, scatter=0.03):
@@ -54,13 +55,20 @@ def tip(radius, number):
 
 def run_of(radius, number, ions):
     simulation = ae.Simulation(tip(radius, number), seed=number)
-    return simulation.run(ions, [ae.Unperturbed(), ae.RollUp(ENERGY, probability=0.5)], responses=False, progress=False)
+    return simulation.run(ions, EMISSIONS, responses=False, progress=False)
 
 
 @pytest.fixture(scope="module")
 def family(made_once):
-    emissions = [ae.Unperturbed(), ae.RollUp(ENERGY, probability=0.5)]
-    return [made_once(tip(radius, radius), 1000, emissions, responses=False, seed=radius) for radius in (8, 10, 12, 14)]
+    return [made_once(tip(radius, radius), 1000, EMISSIONS, responses=False, seed=radius) for radius in (8, 10, 12, 14)]
+
+
+@pytest.fixture(scope="module")
+def pretended(made_once):
+    """The first of the family as if it were of four tips, for tests of what is refused."""
+    run = made_once(tip(8, 8), 1000, EMISSIONS, responses=False, seed=8)
+    tips = [run.settings["tip"] | {"apex_radius": radius * 0.352} for radius in (8, 10, 12, 14)]
+    return [replace(run, settings=run.settings | {"tip": tip}) for tip in tips]
 
 
 def window(run):
@@ -97,22 +105,22 @@ def test_runs_and_a_map(family):
         ({"draws": 2}, "draws must be 1 for runs without responses.*, got 2"),
     ],
 )
-def test_bad_arguments_are_refused(family, change, message):
-    measured = window(family[0])
-    projection = ae.analysis.image_compression(family[0]).projection
-    runs = family[: change.pop("runs", 4)]
+def test_bad_arguments_are_refused(pretended, change, message):
+    measured = window(pretended[0])
+    projection = ae.analysis.image_compression(pretended[0]).projection
+    runs = pretended[: change.pop("runs", 4)]
     arguments = {"perturbations": ae.RollUp(ENERGY, probability=0.5), "plane": (1, 1, 1)} | change
     with pytest.raises(ValueError, match=message):
         ae.fit.fit_radius(runs, measured, projection, **arguments)
 
 
-def test_a_run_without_a_radius_is_refused(family):
-    settings = dict(family[0].settings) | {"tip": {"positions": "of a file"}}
-    runs = [replace(family[0], settings=settings), *family[1:]]
+def test_a_run_without_a_radius_is_refused(pretended):
+    settings = dict(pretended[0].settings) | {"tip": {"positions": "of a file"}}
+    runs = [replace(pretended[0], settings=settings), *pretended[1:]]
     with pytest.raises(ValueError, match="apex radius of a run"):
         ae.fit.fit_radius(
             runs,
-            window(family[0]),
+            window(pretended[0]),
             ae.detection.Projection(50.0),
             ae.RollUp(ENERGY, probability=0.5),
             (1, 1, 1),
