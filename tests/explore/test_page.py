@@ -719,6 +719,7 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     page.close()
 
 
+@pytest.mark.usefixtures("spectra_once")
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
     """Species of a file of ranges are selected as its command selects them; a fitted flight length is only offered."""
