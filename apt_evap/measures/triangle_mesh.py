@@ -154,14 +154,16 @@ class TriangleMesh:
         far = np.full(len(places), np.inf)
         corners = self.vertices[self.faces]
         centres = corners.mean(axis=1)
-        size = float(np.linalg.norm(corners - centres[:, None], axis=2).max())
+        sizes = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
+        size = float(sizes.max())
         tree = scipy.spatial.cKDTree(centres)
         # a surface within the reach has the centre of its triangle within the reach and the size of the triangle
         left = np.flatnonzero(tree.query(places, distance_upper_bound=reach + size)[0] < np.inf)
         numbers = np.full(len(places), min(_NEAREST, len(self)))
         for again in (False, True):
             if again and len(left):  # another triangle can be nearer than its centre by its size
-                numbers[left] = tree.query_ball_point(places[left], far[left] + size, return_length=True)
+                within = np.minimum(far[left], reach) + size
+                numbers[left] = tree.query_ball_point(places[left], within, return_length=True)
                 left = left[numbers[left] > _NEAREST]
             # as many triangles as the next power of two, of as many ions as the memory allows
             powers = np.ceil(np.log2(numbers[left])).astype(int)
@@ -169,20 +171,33 @@ class TriangleMesh:
                 k = min(1 << int(power), len(self))
                 chosen = left[powers == power]
                 for rows in np.array_split(chosen, -(-len(chosen) * k // _CHUNK)):
-                    distances[rows], on_rim[rows], far[rows] = self._signed(places[rows], tree, k, size)
+                    distances[rows], on_rim[rows], far[rows] = self._signed(
+                        places[rows], tree, k, sizes, np.minimum(far[rows], reach)
+                    )
         distances[~(far <= reach)] = np.nan
         return distances, on_rim
 
-    def _signed(self, points, tree, k, size):
-        """Signed distance from the nearest of the k triangles around, whether it is on the rim, and its length."""
+    def _signed(self, points, tree, k, sizes, known):
+        """Signed distance from the nearest of the k triangles around, whether it is on the rim, and its length.
+
+        Compared are the first triangle, and those that can be as near as the known distance.
+        """
         away, candidates = tree.query(points, k=np.arange(1, k + 1))
         n = len(points)
-        # bound: distance from the plane of the triangle, and within it from the circle about its centre
+        known = np.minimum(known, away[:, 0]) + 1e-9 * sizes.max()  # what it is compared with is rounded
+        # at least the distance from the plane of the triangle, and within it from the circle about its centre
         plane = np.abs(np.einsum("ni,nki->nk", points, self._normals[candidates]) - self._offsets[candidates])
         within = np.sqrt(np.maximum(away**2 - plane**2, 0.0))
-        bound = np.sqrt(plane**2 + np.maximum(within - size, 0.0) ** 2)
-        row, column = np.nonzero(bound <= away.min(axis=1, keepdims=True))
+        bound = np.sqrt(plane**2 + np.maximum(within - sizes[candidates], 0.0) ** 2)
+        bound[:, 0] = 0.0
+        row, column = np.nonzero(bound <= known[:, None])
         face = candidates[row, column]
+        # and from the lines of its sides
+        sides, offsets = self._sides
+        beyond = np.einsum("ni,nki->nk", points[row], sides[face]) - offsets[face]
+        near = plane[row, column] ** 2 + np.maximum(beyond.max(axis=1), 0.0) ** 2 <= known[row] ** 2
+        near |= column == 0
+        row, face = row[near], face[near]
         closest, feature = _closest_on(points[row], self.vertices[self.faces[face]])
         step = points[row] - closest
         squares = np.einsum("ni,ni->n", step, step)
@@ -201,6 +216,14 @@ class TriangleMesh:
             normals[at], rim[at] = edge_normals[edges], edge_on_rim[edges]
         length = np.sqrt(squares[first])
         return np.where(np.einsum("ni,ni->n", step, normals) < 0, -length, length), rim, length
+
+    @cached_property
+    def _sides(self):
+        """Normals of the sides in the plane of their triangle, outwards, and their distances from the origin."""
+        corners = self.vertices[self.faces]
+        outwards = np.cross(np.roll(corners, -1, axis=1) - corners, self._normals[:, None])
+        outwards /= np.linalg.norm(outwards, axis=2, keepdims=True)
+        return outwards, np.einsum("nki,nki->nk", outwards, corners)
 
     @cached_property
     def _edges(self):
