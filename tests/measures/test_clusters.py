@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.spectra.ion_names import Abundances
 
 Settings = ae.measures.ClusterSettings
 
@@ -150,3 +151,48 @@ def test_distances_of_neighbours_are_those_of_all_pairs():
 def test_wrong_arguments_are_named(call, message):
     with pytest.raises(ValueError, match=message):
         call(*cloud(1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("radius", "share", "matrix"), [(1.0, 0.6, 0.01), (0.8, 0.4, 0.02), (1.5, 0.25, 0.05)])
+def test_the_choice_is_near_the_best_of_all_parameters(radius, share, matrix):
+    """Known balls: the solutes that are found, by their harmonic mean of precision and recall."""
+    rng = np.random.default_rng(1)
+    centres = np.array([[x, y, z] for x in (3, 9) for y in (3, 9) for z in (3, 9)]) + 0.5 * rng.normal(size=(8, 3))
+    positions = 12 * rng.random((51_840, 3))
+    inside = np.linalg.norm(positions[:, None] - centres, axis=2).min(axis=1) < radius
+    solute = rng.random(len(positions)) < np.where(inside, share, matrix)
+
+    def merit(d_max, n_min):
+        found = ae.measures.label_clusters(positions[solute], np.ones(solute.sum(), bool), Settings(d_max, n_min))[0]
+        return 2 * np.count_nonzero((found >= 0) & inside[solute]) / ((found >= 0).sum() + inside[solute].sum())
+
+    choice = ae.measures.choose_separation(positions, solute)
+    every = [merit(d_max, n_min) for d_max in choice.separations for n_min in (3, 8, 20, 30)]
+    assert choice.found and merit(choice.d_max, choice.n_min) > max(every) - 0.05 > min(every)
+
+
+def test_a_spectrum_gives_the_composition_of_clusters_without_background_and_overlaps():
+    rng = np.random.default_rng(1)
+    positions = 8 * rng.random((20_000, 3))
+    inside = np.linalg.norm(positions - 4, axis=1) < 1.6
+    chromium = rng.random(20_000) < np.where(inside, 0.6, 0.05)
+    mass = np.empty(20_000)
+    for element, rows in (("Cr", chromium), ("Fe", ~chromium)):
+        lines, shares = Abundances().lines(element)
+        mass[rows] = rng.choice(lines, rows.sum(), p=shares / shares.sum()) / 2
+    mass *= 1 + rng.normal(0, 4e-4, 20_000) + rng.exponential(1e-3, 20_000)
+    background = rng.random(20_000) < 0.15
+    mass[background] = (3 + 5 * rng.random(background.sum())) ** 2
+    hits = ae.Hits(mass_to_charge=mass, positions=positions)
+    # 54Cr is in the range of iron
+    ranges = ae.spectra.Ranges(["Cr", "Fe"], [24.8, 26.8], [26.7, 28.5])
+    clusters = ae.measures.PointCloud.of(hits, ranges).clusters("Cr", 0.4, 20)
+    assert len(clusters) == 1
+    spectrum = ae.spectrum(hits, ["Fe", "Cr"])
+    for rows in (clusters.labels >= 0, clusters.labels < 0):
+        composition = spectrum.composition_of(rows)
+        true = 100 * np.mean(chromium[rows & ~background])
+        assert abs(composition["Cr"] - true) < 3 * composition.error["Cr"] < 10
+    in_ranges, _ = clusters.matrix_fractions()["Cr"]
+    assert abs(100 * in_ranges - true) > 3 * abs(composition["Cr"] - true)
