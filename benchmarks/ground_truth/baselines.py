@@ -1,0 +1,245 @@
+"""Answers by the methods of this package, and by two others: ``python baselines.py FOLDER [NAME ...]``.
+
+Reads ``measured`` only, and writes ``answers/cap`` and ``answers/evolving``. With ``--program apyt`` the positions of
+this package are written instead, with the radius and the compression of ``answers/cap``; with ``--program pyccapt`` the
+clusters that it finds in the positions of ``answers/cap``. Run both by the Python that has the package.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+FIELD_FACTOR = 3.3  # of the literature; those of the specimens are 2.8 to 3.8
+FAMILIES = {"fcc": ((1, 1, 1), (0, 0, 2), (0, 2, 2)), "bcc": ((0, 1, 1), (0, 0, 2), (1, 1, 2))}
+STEP = 0.1  # nm, of profiles
+
+
+def read(path):
+    """Columns and attributes of a measurement."""
+    with h5py.File(path) as file:
+        return {name: file[name][()] for name in file}, dict(file.attrs)
+
+
+def common(given):
+    """Constants of a reconstruction that are given."""
+    rim = given["field_of_view"] / 2
+    named = {name: float(given[name]) for name in ("distance", "efficiency", "atomic_volume")}
+    return named | {"detector_radius": float(rim), "projection": "compressed"}
+
+
+def orientation(hits, given):
+    """What `index` finds: the result, and the image compression of its first candidate (1 without one)."""
+    import apt_evap as ae
+
+    distance = float(given["distance"])
+    across = np.hypot(hits.x, hits.y)
+    flat = distance * np.arctan(across / distance) / np.maximum(across, 1e-9)  # angles of flight in place of a plane
+    hits = ae.Hits(x=flat * hits.x, y=flat * hits.y)
+    found = ae.index(hits, given["material"], scales=(distance / 1.3, distance / 0.95))
+    return found, distance / found.best.projection.scale if found.candidates else 1.0
+
+
+def calibrated_radius(hits, given, found, radius, compression):
+    """Radius of the apex with which the planes of a pole have their spacing; None if no planes are found."""
+    import apt_evap as ae
+
+    for family in FAMILIES[given["crystal"]]:
+        pole = found.best.orientation.nearest_pole(family).direction
+        if pole[2] < np.cos(np.radians(32)):
+            continue
+        volume = ae.reconstruct(hits, radius=radius, compression=compression, **common(given))
+        # turned until the pole is along z, about the place where it leaves the surface
+        across = np.hypot(*pole[:2])
+        axis = np.array([-pole[1], pole[0], 0.0]) / max(across, 1e-12)
+        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+        turn = np.eye(3) - across * cross + (1 - pole[2]) * cross @ cross
+        turned = volume.specimen_positions @ turn.T
+        at = (turn @ (radius * pole * (1, 1, 0) + (0, 0, np.median(volume.specimen_positions[:, 2]))))[:2]
+        try:
+            planes = ae.reconstruction.find_planes(turned, at, radius=1.0, reach=0.8)
+        except ValueError:
+            continue
+        spacing = float(given["a"]) / np.linalg.norm(family)
+        if planes.found and 0.5 < planes.spacing / spacing < 2:
+            return radius * np.sqrt(planes.spacing / spacing)
+    return None
+
+
+def normal_of_layers(positions, marked, tilts):
+    """Direction along which the fraction of the solute varies most beyond chance."""
+    points = positions - positions.mean(axis=0)
+    best, chosen = -np.inf, None
+    for tilt in np.radians(tilts):
+        for turn in np.radians(np.arange(0, 360, max(3, 3 / max(np.sin(tilt), 0.1)))):
+            normal = np.array((np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)))
+            bins = np.floor((points @ normal) / STEP).astype(int)
+            bins -= bins.min()
+            ions, solutes = np.bincount(bins), np.bincount(bins, marked)
+            full = ions > 20
+            score = (solutes[full] ** 2 / ions[full]).sum() - np.count_nonzero(full) * marked.mean()
+            if score > best:
+                best, chosen = score, normal
+    return chosen
+
+
+def layers(cloud, solute):
+    """Thickness, spacing and shares of layers by a profile along their normal."""
+    marked = cloud.mark(solute).astype(float)
+    profile = cloud.profile(normal_of_layers(cloud.positions, marked, np.arange(0, 75, 3)), STEP).of(solute)
+    full = profile.ions > 20
+    fraction, places = profile.fraction[full], profile.centres[full]
+    base, top = np.quantile(fraction, 0.2), np.sort(fraction)[-4:].mean()
+    above = fraction > (base + top) / 2
+    starts = np.flatnonzero(np.diff(np.r_[False, above].astype(int)) == 1)
+    ends = np.flatnonzero(np.diff(np.r_[above, False].astype(int)) == -1) + 1
+    cuts = [slice(a, b) for a, b in zip(starts, ends, strict=True) if b - a > 1]
+    if not cuts:
+        return {}
+    thickness = np.sum(np.clip(fraction - base, 0, None)) / (top - base) * STEP / len(cuts)
+    middles = [np.average(places[cut], weights=fraction[cut]) for cut in cuts]
+    answers = {"thickness": (thickness, np.nan), f"{solute} of phase": (100 * top, np.nan)}
+    answers[f"{solute} of matrix"] = (100 * base, np.nan)
+    return answers | ({"spacing": (float(np.mean(np.diff(middles))), np.nan)} if len(cuts) > 1 else {})
+
+
+def boundary(cloud, solute, given):
+    """Excess of a boundary whose normal is found; its area is that of the atoms about it."""
+    import apt_evap as ae
+
+    marked = cloud.mark(solute)
+    normal = normal_of_layers(cloud.positions, marked.astype(float), np.arange(60, 91, 3))
+    along = (cloud.positions - cloud.positions.mean(axis=0)) @ normal
+    ions, edges = np.histogram(along, np.arange(along.min(), along.max(), STEP))
+    solutes = np.histogram(along[marked], edges)[0]
+    middle = edges[np.argmax(np.convolve(np.where(ions > 20, solutes / np.maximum(ions, 1), 0), np.ones(5), "same"))]
+    distances, window = along - middle, 1.2
+    atoms = np.count_nonzero(np.abs(distances) <= window) / float(given["efficiency"])
+    area = atoms * float(given["atomic_volume"]) / (2 * window)
+    excess = ae.measures.interfacial_excess(distances, marked, area, window, 3.0, float(given["efficiency"]))
+    return {"excess": excess}
+
+
+def precipitates(cloud, given):
+    """Number, radius and shares by clusters whose d_max is chosen against random labels."""
+    solute = given["solute"]
+    clusters = cloud.clusters(solute)
+    shares = {"matrix": clusters.matrix_fractions()}
+    answers = {"number": (float(len(clusters)), np.nan)}
+    if len(clusters):
+        answers["radius"] = (float(clusters.radii.mean()), np.nan)
+        shares["phase"] = clusters.fractions()
+    if shell := given["shell"]:
+        around = np.linalg.norm(cloud.positions - (clusters.centres[0] if len(clusters) else 0.0), axis=1)
+        inner = answers.get("radius", (0.0,))[0]
+        # outer radius of a shell of uniform density with this mean square
+        square = np.mean(around[cloud.mark(shell) & (around < 3 * inner)] ** 2) if inner else np.nan
+        outer = np.linspace(inner + 0.01, 4 * inner + 0.02, 2000)
+        of = 0.6 * (outer**5 - inner**5) / (outer**3 - inner**3)
+        answers["shell thickness"] = (float(np.interp(square, of, outer) - inner), np.nan)
+        inside = (around > inner) & (around < inner + answers["shell thickness"][0])
+        shares["shell"] = cloud.select(inside).fractions()
+    for phase, part in shares.items():
+        for element, (share, error) in part.items():
+            answers[f"{element} of {phase}"] = (100 * share, 100 * error)
+    return answers
+
+
+def structure(cloud, given):
+    """Answers about composition and structure."""
+    if given["structure"] == "layers":
+        return layers(cloud, given["solute"])
+    return boundary(cloud, given["solute"], given) if given["structure"] == "boundary" else precipitates(cloud, given)
+
+
+def write(path, answers, positions, asked):
+    """Write the answers to what is asked for."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for quantity, (value, error) in answers.items():
+            if (quantity in asked or quantity.startswith("axis ")) and np.isfinite(value):
+                file[quantity] = [value, error]
+        if positions is not None:
+            file["positions"] = positions.astype(np.float32)
+
+
+def by_this_package(folder, name):
+    """Answers of the cap and of the evolving surface, both with constants that are found."""
+    import apt_evap as ae
+
+    warnings.simplefilter("ignore", ae.warnings.AptWarning)  # no clusters, or the cap in place of the surface
+    columns, given = read(folder / "measured" / f"{name}.h5")
+    asked, start = json.loads(given["questions"]), time.process_time()
+    hits = ae.Hits(x=columns["x"], y=columns["y"], voltage=columns["voltage"],
+                   extra={"element": columns["element"].astype(str)})  # fmt: skip
+    found, compression = orientation(hits, given)
+    radius = float(np.median(columns["voltage"])) / (FIELD_FACTOR * float(given["evaporation_field"]))
+    planes = calibrated_radius(hits, given, found, radius, compression) if found.candidates else None
+    radius = planes or radius
+    answers = {"apex radius": (radius, np.nan), "compression": (compression, np.nan)}
+    if found.decided and "axis" in asked:
+        axis = np.asarray(found.best.orientation.axis, dtype=float)
+        answers |= {f"axis {index}": (value, np.nan) for index, value in zip("hkl", axis, strict=True)}
+    solutes = [solute for solute in (given["solute"], given["shell"]) if solute]
+    known = common(given) | {"radius": radius, "compression": compression}
+    for method, options in (("cap", {}), ("evolving", {"shape": "evolving", "solutes": solutes})):
+        volume = ae.reconstruct(hits, **known, **options)
+        cloud = ae.measures.PointCloud.of(volume.hits, positions=volume.specimen_positions)
+        measured = structure(cloud, given)
+        write(folder / "answers" / method / f"{name}.h5", answers | measured, volume.specimen_positions, asked)
+    seconds = time.process_time() - start
+    print(f"{name}: {found.verdict}, {'planes' if planes else 'no planes'}, radius {radius:.2f} nm, compression "
+          f"{compression:.3f}; {getattr(volume, 'verdict', '')}; {seconds:.0f} s of processor", flush=True)  # fmt: skip
+
+
+def by_pyccapt(folder, name):
+    """Number and radius of clusters by pyccapt, with the d_max that it estimates, of the positions of our cap."""
+    from pyccapt.calibration.clustering import clustering
+
+    columns, given = read(folder / "measured" / f"{name}.h5")
+    with h5py.File(folder / "answers" / "cap" / f"{name}.h5") as file:
+        points = file["positions"][()][columns["element"] == given["solute"].encode()]
+    separation = clustering.estimate_maximum_separation_distance(points)
+    labels, centres = clustering.maximum_separation_clustering(points, d_max=separation, n_min=10)
+    answers = {"number": (float(len(centres)), np.nan)}
+    if len(centres):
+        squares = [points[labels == one].var(axis=0).sum() for one in range(len(centres))]
+        answers["radius"] = (float(np.sqrt(5 / 3 * np.array(squares)).mean()), np.nan)
+    write(folder / "answers" / "pyccapt" / f"{name}.h5", answers, None, json.loads(given["questions"]))
+
+
+def by_apyt(folder, name):
+    """Positions by the classic geometry of APyT, with the constants of our cap."""
+    from apyt.reconstruction.basic import get_geometry_classic, reconstruct
+
+    columns, given = read(folder / "measured" / f"{name}.h5")
+    with h5py.File(folder / "answers" / "cap" / f"{name}.h5") as file:
+        radius, compression = (float(file[quantity][0]) for quantity in ("apex radius", "compression"))
+    distance, rim = float(given["distance"]), float(given["field_of_view"] / 2)
+    compression *= distance / rim * np.arctan(rim / distance)  # theirs is the angle over the tangent
+    radii = np.full(len(columns["x"]), radius)
+    volumes = np.full(len(radii), float(given["atomic_volume"] / given["efficiency"]))
+    depths, radii = get_geometry_classic(volumes, radii, compression * rim / distance)
+    positions = reconstruct(np.column_stack([columns["x"], columns["y"]]), depths, radii, distance, compression)
+    write(folder / "answers" / "apyt" / f"{name}.h5", {}, positions * (1, 1, -1), [])
+
+
+METHODS = {None: by_this_package, "pyccapt": by_pyccapt, "apyt": by_apyt}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("names", nargs="*", help="specimens; default: all that are measured")
+    parser.add_argument("--program", choices=("pyccapt", "apyt"), help="another package")
+    options = parser.parse_args()
+    for name in options.names or sorted(path.stem for path in (options.folder / "measured").glob("*.h5")):
+        METHODS[options.program](options.folder, name)
+
+
+if __name__ == "__main__":
+    main()
