@@ -196,3 +196,15 @@ def test_a_spectrum_gives_the_composition_of_clusters_without_background_and_ove
         assert abs(composition["Cr"] - true) < 3 * composition.error["Cr"] < 10
     in_ranges, _ = clusters.matrix_fractions()["Cr"]
     assert abs(100 * in_ranges - true) > 3 * abs(composition["Cr"] - true)
+
+
+def test_clusters_are_those_of_pyccapt():
+    theirs = pytest.importorskip("pyccapt.calibration.clustering.clustering", reason="pyccapt is not installed")
+    rng = np.random.default_rng(5)
+    points = np.concatenate([10 * rng.random((3000, 3)), *(10 * rng.random(3) + 0.3 * rng.normal(size=(5, 60, 3)))])
+    ours = ae.measures.label_clusters(points, np.ones(len(points), bool), Settings(0.45, 10))[0]
+    labels, _ = theirs.maximum_separation_clustering(points, d_max=0.45, n_min=10)
+    assert ours.max() == labels.max() > 3
+    assert {frozenset(np.flatnonzero(ours == one)) for one in range(ours.max() + 1)} == {
+        frozenset(np.flatnonzero(labels == one)) for one in range(labels.max() + 1)
+    }
