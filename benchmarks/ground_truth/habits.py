@@ -1,7 +1,7 @@
 """Measures of all sites, of the recorded ions at their sites, and of their reconstructions: ``habits.py FOLDER``.
 
-Constants are those that fit the sites best, so that detection and trajectories remain. Prints docs/ground_truth.rst's
-table of the specimens, and how far each usual d_max and isoconcentration is moved, the worst one first.
+Constants are those that fit the sites best, so that detection and trajectories remain. Prints each specimen, and how
+far each usual d_max and isoconcentration is moved, the worst one first.
 """
 
 import sys
