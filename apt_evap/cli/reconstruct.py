@@ -235,7 +235,10 @@ def _crystal(options, settings, crystal):
         raise ValueError(f"--check needs --shape evolving and --element, got {got}")
     material = as_material(material)
     axis = options.check or ((0, 0, 1) if crystal is None else crystal.axis)
-    return material, check_axis(material.structure, axis, "--check")
+    try:
+        return material, check_axis(material.structure, axis)
+    except ValueError as error:
+        raise ValueError(f"--check: {error}") from error
 
 
 def _tell_check(options, reconstruction, material, axis):

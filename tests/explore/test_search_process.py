@@ -122,7 +122,7 @@ def test_a_search_whose_process_is_killed_is_over(measured):
 
 
 def test_a_flight_length_bounds_the_scale_of_a_search_unless_one_is_typed(measured, monkeypatch):
-    """In the explorer as in the command: tungsten is decided by its flight length."""
+    """In the explorer as in the command."""
     called = []
 
     class Process:
