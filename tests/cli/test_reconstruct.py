@@ -178,3 +178,23 @@ def test_few_ions_are_reconstructed(measured, tmp_path, capsys, ions):
         capsys.readouterr()
         assert main([*command[:-1], "other.pos", "--picture", "p.png"]) == 2
         assert "at least 50 ions" in capsys.readouterr().err and not (tmp_path / "other.pos").exists()
+
+
+@pytest.mark.slow  # a minute: the example, and two simulations of what is found in it
+def test_the_precipitate_of_the_example_is_found_measured_and_confirmed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "precipitate", "-o", "p.h5", "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["reconstruct", "p.h5", "--shape", "evolving", "--solutes", "Cu", "--check", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    (phase,) = found["surface"]["phases"]
+    assert abs(phase["ratio"] - 23 / 19) < 2 * phase["error"] < 0.1
+    check = found["check"]
+    assert check["axis"] == [0, 0, 1] and check["confirmed"] and 0.4 < check["explained"] < 1
+    run = ae.read("p.h5")
+    sites = run.hits(run.first_perturbation).positions
+    sphere = sites[((sites - (1.0, 0.0, 4.9)) ** 2).sum(axis=1) < 1.2**2]  # what left of it
+    axes = np.sqrt(5) * sphere.std(axis=0)
+    (size,) = check["sizes"]
+    assert abs(size["lateral"] - axes[:2].mean()) < 2 * size["lateral_error"] < 0.3
+    assert abs(size["depth"] - axes[2]) < 2 * size["depth_error"] < 0.3
