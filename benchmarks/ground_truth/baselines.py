@@ -124,25 +124,45 @@ def boundary(cloud, solute, given):
     return {"excess": excess}
 
 
+def ellipsoids(clusters):
+    """Ions in the uniform ellipsoids that have the centres and covariances of the solutes of clusters.
+
+    Envelope and erosion keep the solvent that is near solutes only: of a true sphere with 37 % they find 60 %.
+    """
+    positions, inside = clusters.cloud.positions, np.zeros(len(clusters.cloud), bool)
+    for number, centre in enumerate(clusters.centres):
+        covariance = np.cov(positions[clusters.members == number].T) + 1e-4 * np.eye(3)
+        away = positions - centre
+        inside |= np.einsum("ni,ij,nj->n", away, np.linalg.inv(covariance), away) < 5
+    return inside
+
+
+def shell_about(cloud, clusters, shell):
+    """Thickness of a shell about the largest cluster [nm], and the ions between it and the cluster."""
+    around, inner = np.linalg.norm(cloud.positions - clusters.centres[0], axis=1), float(clusters.radii[0])
+    # outer radius of a shell of uniform density with this mean square
+    square = np.mean(around[cloud.mark(shell) & (around < 3 * inner)] ** 2)
+    outer = np.linspace(inner + 0.01, 4 * inner + 0.02, 2000)
+    of = 0.6 * (outer**5 - inner**5) / (outer**3 - inner**3)
+    thickness = float(np.interp(square, of, outer)) - inner
+    return thickness, (around > inner) & (around < inner + thickness) & ~ellipsoids(clusters)
+
+
 def precipitates(cloud, given):
     """Number, radius and shares by clusters whose d_max is chosen against random labels."""
     solute = given["solute"]
     clusters = cloud.clusters(solute)
-    shares = {"matrix": clusters.matrix_fractions()}
-    answers = {"number": (float(len(clusters)), np.nan)}
+    answers, shares, rich = {"number": (float(len(clusters)), np.nan)}, {}, ellipsoids(clusters)
+    outside = (clusters.labels < 0) & ~rich
     if len(clusters):
         answers["radius"] = (float(clusters.radii.mean()), np.nan)
-        shares["phase"] = clusters.fractions()
-    if shell := given["shell"]:
-        around = np.linalg.norm(cloud.positions - (clusters.centres[0] if len(clusters) else 0.0), axis=1)
-        inner = answers.get("radius", (0.0,))[0]
-        # outer radius of a shell of uniform density with this mean square
-        square = np.mean(around[cloud.mark(shell) & (around < 3 * inner)] ** 2) if inner else np.nan
-        outer = np.linspace(inner + 0.01, 4 * inner + 0.02, 2000)
-        of = 0.6 * (outer**5 - inner**5) / (outer**3 - inner**3)
-        answers["shell thickness"] = (float(np.interp(square, of, outer) - inner), np.nan)
-        inside = (around > inner) & (around < inner + answers["shell thickness"][0])
+        shares["phase"] = cloud.select(rich).fractions()
+    if (shell := given["shell"]) and len(clusters):
+        thickness, inside = shell_about(cloud, clusters, shell)
+        answers["shell thickness"] = (thickness, np.nan)
         shares["shell"] = cloud.select(inside).fractions()
+        outside &= ~inside
+    shares["matrix"] = cloud.select(outside).fractions()
     for phase, part in shares.items():
         for element, (share, error) in part.items():
             answers[f"{element} of {phase}"] = (100 * share, 100 * error)

@@ -1,7 +1,7 @@
-"""Measures of all sites, of the recorded ions at their sites, and of their reconstructions: ``habits.py FOLDER``.
+"""Usual measures of all sites, of the recorded ions at their sites, and of reconstructions: ``habits.py FOLDER``.
 
-Constants are those that fit the sites best, so that detection and trajectories remain. Prints each specimen, and how
-far each usual d_max and isoconcentration is moved, the worst one first.
+Constants of the reconstructions are those that fit the sites best, so that detection and trajectories remain. Prints
+each specimen beside its truth, and the error of each usual d_max and isoconcentration.
 """
 
 import sys
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from baselines import common, read
+from baselines import STEP, boundary, common, normal_of_layers, read
 from score import read_truth
 
 import apt_evap as ae
@@ -22,7 +22,7 @@ WAYS = ("all sites", "recorded", "cap", "evolving")
 
 
 def clouds(folder, name):
-    """Point clouds of a specimen by `WAYS`, in its coordinates."""
+    """Point clouds of a specimen by `WAYS`, in its coordinates, what is given, and the answers."""
     columns, given = read(folder / "measured" / f"{name}.h5")
     answers, sites, _ = read_truth(folder / "truth" / f"{name}.h5")
     hits = ae.Hits(x=columns["x"], y=columns["y"], voltage=columns["voltage"], positions=sites,
@@ -39,21 +39,45 @@ def clouds(folder, name):
         volume = ae.reconstruct(hits, **known, **options)
         placed = volume.fitted_positions(sites, ("shift", "rotation"))
         parts.append(ae.measures.PointCloud.of(volume.hits, positions=placed))
-    return dict(zip(WAYS, parts, strict=True)), given["solute"]
+    return dict(zip(WAYS, parts, strict=True)), given, answers
 
 
-def measures(cloud, solute):
-    """Clusters by each d_max, and volume above each isoconcentration [nm^3]."""
-    values = {}
-    for separation in SEPARATIONS:
-        clusters = cloud.clusters(solute, separation, FEWEST)
-        values[f"clusters, d_max {separation}"] = float(len(clusters))
-        values[f"solutes in clusters, d_max {separation}"] = clusters.clustered_fraction
-        values[f"radius, d_max {separation}"] = float(clusters.radii.mean()) if len(clusters) else np.nan
-    field = cloud.field(solute)
-    for share in SHARES:
-        inside = field.filled() & (np.nan_to_num(field.fraction) > share)
-        values[f"volume, {100 * share:.0f} %"] = np.count_nonzero(inside) * field.voxel**3
+def measures(cloud, given, answers):
+    """Values by measure and setting, and the truth of each; 0 for what is not found."""
+    solute, values = given["solute"], {}
+    if "number" in answers:
+        for separation in SEPARATIONS:
+            clusters = cloud.clusters(solute, separation, FEWEST)
+            if answers["number"]:
+                size = float(clusters.radii.mean()) if len(clusters) else 0.0
+                values["number of clusters", separation] = float(len(clusters)), answers["number"]
+                values["radius of clusters", separation] = size, answers["radius"]
+            else:
+                values["clusters of a random alloy", separation] = float(len(clusters)), 0.0
+    if answers.get("number"):
+        field = cloud.field(solute)
+        for share in SHARES:
+            inside = field.filled() & (np.nan_to_num(field.fraction) > share)
+            each = np.count_nonzero(inside) * field.voxel**3 / answers["number"]
+            values["radius by isoconcentration", share] = np.cbrt(3 * each / (4 * np.pi)), answers["radius"]
+    if "thickness" in answers:
+        marked = cloud.mark(solute).astype(float)
+        normal = normal_of_layers(cloud.positions, marked, np.arange(0, 75, 3))
+        profile = cloud.profile(normal, STEP).of(solute)
+        for share in SHARES:
+            above = (profile.ions > 20) & (np.nan_to_num(profile.fraction) > share)
+            values["thickness by isoconcentration", share] = np.count_nonzero(above) * STEP / 2, answers["thickness"]
+    if f"{solute} of phase" in answers:
+        for share in SHARES:
+            try:
+                profile = cloud.proxigram(solute, share)
+                inside = profile.atoms[profile.centres < 0].sum(axis=0)
+                found = 100 * inside[profile.elements.index(solute)] / max(inside.sum(), 1)
+            except ValueError:  # no such surface
+                found = 0.0
+            values["solute inside the isosurface", share] = found, answers[f"{solute} of phase"]
+    if "excess" in answers:
+        values["excess", ""] = boundary(cloud, solute, given)["excess"][0], answers["excess"]
     return values
 
 
@@ -61,26 +85,24 @@ def main(folder):
     warnings.simplefilter("ignore", ae.warnings.AptWarning)
     table = {}
     for path in sorted((folder / "measured").glob("*.h5")):
-        parts, solute = clouds(folder, path.stem)
-        table[path.stem] = {way: measures(cloud, solute) for way, cloud in parts.items()}
+        parts, given, answers = clouds(folder, path.stem)
+        table[path.stem] = {
+            way: measures(cloud, given | ({"efficiency": 1.0} if way == "all sites" else {}), answers)
+            for way, cloud in parts.items()
+        }
         print(path.stem, {way: len(cloud) for way, cloud in parts.items()}, flush=True)
-        for name in next(iter(table[path.stem].values())):
-            row = [table[path.stem][way][name] for way in WAYS]
-            print(f"  {name:36}" + "".join(f"{value:10.3g}" for value in row))
-    print("RMS of ln(reconstruction / all sites), of the specimens with a structure; lost: nothing was found")
-    rows = []
-    for name in next(iter(next(iter(table.values())).values())):
-        kinds = ("precipitates", "core", "layers") if name.startswith("volume") else ("precipitates", "core")
-        with_structure = [one for one in table if one.startswith(kinds)]
+        for key, (_, true) in table[path.stem]["cap"].items():
+            row = [table[path.stem][way][key][0] for way in WAYS]
+            print(f"  {key[0]:30}{key[1]:<6}{true:10.3g}" + "".join(f"{value:10.3g}" for value in row))
+    print(f"RMS of the relative error [%], or mean number of a random alloy:\n{'':46}{WAYS}")
+    keys = dict.fromkeys(key for ways in table.values() for key in ways["cap"])
+    for key in sorted(keys, key=str):
+        of = [ways for ways in table.values() if key in ways["cap"]]
         cells = []
-        for way in WAYS[1:]:
-            pairs = np.array([(table[one][way][name], table[one][WAYS[0]][name]) for one in with_structure])
-            known = (pairs > 0).all(axis=1)
-            size = np.sqrt(np.mean(np.log(pairs[known, 0] / pairs[known, 1]) ** 2)) if known.any() else np.nan
-            cells.append((size, int(((pairs[:, 1] > 0) & ~(pairs[:, 0] > 0)).sum())))
-        rows.append((name, cells))
-    for name, cells in sorted(rows, key=lambda row: (row[0].split(",")[0], -row[1][1][0])):
-        print(f"  {name:36}" + "".join(f"{size:10.2f} ({lost} lost)" for size, lost in cells))
+        for way in WAYS:
+            found, true = np.array([ways[way][key] for ways in of]).T
+            cells.append(100 * np.sqrt(np.mean((found / true - 1) ** 2)) if true.any() else found.mean())
+        print(f"  {key[0]:30}{key[1]:<6}{len(of):6}" + "".join(f"{cell:10.3g}" for cell in cells))
 
 
 if __name__ == "__main__":

@@ -112,7 +112,7 @@ def score_specimen(values, positions, answers, sites):
         elif quantity in values and np.isfinite(values[quantity][0]):
             value, stated = values[quantity]
             error = abs(value - true)
-            if stated > 0:
+            if stated >= 0:  # a stated error of 0 is one, too
                 held = float(error <= 1.96 * stated)
             if task != "composition":  # a number of 0 counts like one
                 error *= 100 / (abs(true) or 1.0)

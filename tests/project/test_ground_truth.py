@@ -65,7 +65,7 @@ def test_errors_are_those_that_were_put_in_from_csv_and_h5(truth):
     found = errors_of(folder, "mine")
     for name in ("one", "two"):
         assert found[name, "apex radius"] == (pytest.approx(10.0), 1.0)
-        assert found[name, "compression"][0] == 0.0 and np.isnan(found[name, "compression"][1])
+        assert found[name, "compression"] == (0.0, 1.0)  # an error of 0 is stated, and held here
         assert found[name, "number"] == (200.0, 0.0)
         assert found[name, "axis"][0] == pytest.approx(0.0, abs=1e-6)  # an equivalent direction
         assert found[name, "Cu of matrix"] == (0.5, 0.0)
@@ -124,6 +124,27 @@ def test_the_scorer_needs_no_part_of_this_package(truth):
     code += f"try: runpy.run_path({str(FOLDER / 'score.py')!r}, run_name='__main__')\n"
     code += "except SystemExit: pass\nassert not any(name.startswith('apt_evap') for name in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("shell", ["", "Mg"])
+def test_the_shares_of_a_true_ball_and_its_shell_are_found(shell):
+    import apt_evap as ae
+
+    random = np.random.default_rng(4)
+    places = 5 * random.random((6000, 3))
+    around, draw = np.linalg.norm(places - 2.5, axis=1), random.random(len(places))
+    element = np.where(draw < np.where(around < 1, 0.4, 0.02), "Cu", "Al")
+    if shell:
+        element[(around > 1) & (around < 1.4)] = np.where(draw < 0.4, "Mg", "Al")[(around > 1) & (around < 1.4)]
+    cloud = ae.measures.PointCloud.of(ae.Hits(positions=places, extra={"element": element}))
+    found = module("baselines").precipitates(cloud, {"solute": "Cu", "shell": shell})
+    assert found["number"][0] == 1 and found["radius"][0] == pytest.approx(1.0, abs=0.1)
+    assert found["Cu of phase"][0] == pytest.approx(40, abs=3 * found["Cu of phase"][1] + 3)
+    assert found["Cu of matrix"][0] == pytest.approx(2, abs=0.6)
+    if shell:
+        assert found["shell thickness"][0] == pytest.approx(0.4, abs=0.15)  # the error of the radius enters twice
+        assert found["Mg of shell"][0] == pytest.approx(40, abs=8)
+        assert found["Mg of matrix"][0] < 0.5  # those of the shell are not of the matrix: 2.6 % with them
 
 
 @pytest.mark.slow
