@@ -21,7 +21,8 @@ TASKS = {
     "lateral": ("RMS error of the positions across the axis", "nm"),
     "depth": ("RMS error of the positions along the axis", "nm"),
     "composition": ("difference of a share", "at.%"),
-    "structure": ("difference of a size, a spacing, an excess or a number", "%"),
+    "number": ("precipitates or clusters too many or too few", "clusters"),
+    "structure": ("difference of a size, a spacing or an excess", "%"),
 }
 """Tasks, what is measured of each, and its unit: the positions have two numbers."""
 
@@ -93,8 +94,8 @@ def position_errors(positions, sites):
 
 def task_of(quantity):
     """Task that a quantity of the truth belongs to."""
-    if quantity == "axis":
-        return "axis"
+    if quantity in ("axis", "number"):
+        return quantity
     if quantity in ("apex radius", "compression"):
         return "constants"
     return "composition" if " of " in quantity else "structure"
@@ -114,8 +115,8 @@ def score_specimen(values, positions, answers, sites):
             error = abs(value - true)
             if stated >= 0:  # a stated error of 0 is one, too
                 held = float(error <= 1.96 * stated)
-            if task != "composition":  # a number of 0 counts like one
-                error *= 100 / (abs(true) or 1.0)
+            if task in ("constants", "structure"):
+                error *= 100 / abs(true)
         rows.append((task, quantity, error, held))
     lateral, depth = (np.nan, np.nan) if positions is None else position_errors(positions, sites)
     return [*rows, ("lateral", "positions", lateral, np.nan), ("depth", "positions", depth, np.nan)]
