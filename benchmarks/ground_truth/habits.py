@@ -52,6 +52,8 @@ def measures(cloud, given, answers):
                 size = float(clusters.radii.mean()) if len(clusters) else 0.0
                 values["number of clusters", separation] = float(len(clusters)), answers["number"]
                 values["radius of clusters", separation] = size, answers["radius"]
+                share = 100 * np.nan_to_num(clusters.fractions()[solute][0])  # after envelope and erosion by d_max
+                values["solute of clusters", separation] = share, answers[f"{solute} of phase"]
             else:
                 values["clusters of a random alloy", separation] = float(len(clusters)), 0.0
     if answers.get("number"):
