@@ -202,7 +202,8 @@ def by_this_package(folder, name):
     radius = planes or radius
     answers = {"apex radius": (radius, np.nan), "compression": (compression, np.nan)}
     if found.decided and "axis" in asked:
-        axis = np.asarray(found.best.orientation.axis, dtype=float)
+        # the axis of the specimen is seen at the centre of the detector, not at that of the ions
+        axis = (found.best.projection.directions(np.zeros((1, 2))) @ found.best.orientation.matrix)[0]
         answers |= {f"axis {index}": (value, np.nan) for index, value in zip("hkl", axis, strict=True)}
     solutes = [solute for solute in (given["solute"], given["shell"]) if solute]
     known = common(given) | {"radius": radius, "compression": compression}
