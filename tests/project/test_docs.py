@@ -207,6 +207,20 @@ def test_command_lines_are_understood():
             make_parser().parse_args(words)
 
 
+def test_every_option_is_named_in_a_page():
+    """Besides the list that is made from the commands."""
+    from apt_evap.cli.parser import COMMANDS, make_parser
+
+    text = "\n".join(page.read_text() for page in (README, *PAGES))
+    named = set(re.findall(r"--[a-z][a-z0-9-]*", text))
+    options = set()
+    for command in COMMANDS:
+        (commands,) = (action for action in make_parser(command)._actions if isinstance(action.choices, dict))
+        options |= {word for action in commands.choices[command]._actions for word in action.option_strings}
+    assert len(options) > 100
+    assert {option for option in options if option.startswith("--")} - named == set()
+
+
 def test_methods_of_laws_and_rules_have_the_arguments_of_the_code():
     """``name(arguments)`` of the text: a function of the package has the same ones."""
     text = (ROOT / "docs" / "extending_physics.rst").read_text()
