@@ -68,11 +68,13 @@ def execute(options: argparse.Namespace) -> int:
     if true is not None and planes.found:
         factor, error = planes.spacing / true, planes.spacing_error / true
         other = factor**-0.5
-        result |= {"efficiency_factor": factor, "field_factor_factor": other}
+        other_error = error * other / (2 * factor)
+        result |= {"efficiency_factor": factor, "efficiency_factor_error": error}
+        result |= {"field_factor_factor": other, "field_factor_factor_error": other_error}
         tell(
             options,
             f"the spacing is {true:g} nm with {factor:.3f} ± {error:.3f} times the efficiency, or with {other:.3f} ± "
-            f"{error * other / (2 * factor):.3f} times the field factor: it depends on efficiency / field factor^2",
+            f"{other_error:.3f} times the field factor: it depends on efficiency / field factor^2",
         )
     tell_json(options, result)
     return 0

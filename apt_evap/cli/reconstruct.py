@@ -150,7 +150,7 @@ def execute(options: argparse.Namespace) -> int:
     if isinstance(reconstruction, EvolvingReconstruction):
         result["surface"] = _tell_surface(options, reconstruction)
     if options.check is not None:
-        result["check"] = _tell_check(options, reconstruction, material, axis)
+        result["check"] = _tell_check(options, reconstruction, material, axis, not options.check and crystal is None)
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -241,7 +241,7 @@ def _crystal(options, settings, crystal):
         raise ValueError(f"--check: {error}") from error
 
 
-def _tell_check(options, reconstruction, material, axis):
+def _tell_check(options, reconstruction, material, axis, assumed):
     """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
     from apt_evap.reconstruction.phase_size import phase_sizes
     from apt_evap.reconstruction.specimen_check import check_specimen
@@ -254,7 +254,7 @@ def _tell_check(options, reconstruction, material, axis):
         tell(options, str(size))
     check = check_specimen(reconstruction, material, axis=axis)
     along = " ".join(f"{part:g}" for part in axis)
-    tell(options, f"{check}; simulated along [{along}]")
+    tell(options, f"{check}; simulated along [{along}]{', which is assumed: --check H,K,L' if assumed else ''}")
     found = {"explained": check.explained, "error": check.error, "confirmed": check.is_confirmed, "ions": check.ions}
     found["axis"] = list(axis)
     return found | {"sizes": [size._asdict() for size in sizes]}

@@ -16,7 +16,7 @@ def read(
     *,
     format: str | None = None,
     columns: Sequence[str] | None = None,
-    ranges: Any = None,
+    ranges: AnyPath | formats.Ranges | None = None,
     **options: Any,
 ) -> Any:
     """Read a file of ions, a run or a map. The format is recognised by the first bytes if possible, or by the suffix.

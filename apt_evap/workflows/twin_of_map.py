@@ -285,7 +285,7 @@ class Twin:
         return self._facts.best.rolled >= ROLLS
 
     def _as_read(self):
-        """The measurement, with its file for the report, without reading it again."""
+        """The measurement; its file, for the report, is read again for the composition of all its ions only."""
         return MeasuredSource(lambda _: self.measured, self._source.path, self._source.file)
 
     # ---- texts -------------------------------------------------------------------------------------------------------

@@ -1,11 +1,13 @@
 """`apt-evap reconstruct`, of measured ions and of a run."""
 
 import json
+from argparse import Namespace
 
 import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap.cli import reconstruct
 from apt_evap.cli.main import main
 from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.origins import OriginTable
@@ -178,6 +180,17 @@ def test_few_ions_are_reconstructed(measured, tmp_path, capsys, ions):
         capsys.readouterr()
         assert main([*command[:-1], "other.pos", "--picture", "p.png"]) == 2
         assert "at least 50 ions" in capsys.readouterr().err and not (tmp_path / "other.pos").exists()
+
+
+def test_the_specimen_of_a_check_has_crystal_and_axis_of_the_options_or_of_the_run():
+    run = ae.Orientation("Al", (0, 1, 2), 0.0)
+    for check, settings, crystal, name, axis in (
+        ((), {}, run, "Al", (0, 1, 2)),
+        ((1, 1, 1), {"element": "Ni"}, run, "Ni", (1, 1, 1)),
+        ((), {"element": "Ni"}, None, "Ni", (0, 0, 1)),
+    ):
+        material, found = reconstruct._crystal(Namespace(shape="evolving", check=check), settings, crystal)
+        assert (material.name, found) == (name, axis)
 
 
 @pytest.mark.slow  # a minute: the example, and two simulations of what is found in it
