@@ -187,6 +187,11 @@ def write(path, answers, positions, asked):
             file["positions"] = positions.astype(np.float32)
 
 
+def axis_of(candidate):
+    """Crystal direction at the centre of the detector, where the axis of a specimen is seen; not that of the ions."""
+    return (candidate.projection.directions(np.zeros((1, 2))) @ candidate.orientation.matrix)[0]
+
+
 def by_this_package(folder, name):
     """Answers of the cap and of the evolving surface, both with constants that are found."""
     import apt_evap as ae
@@ -202,8 +207,7 @@ def by_this_package(folder, name):
     radius = planes or radius
     answers = {"apex radius": (radius, np.nan), "compression": (compression, np.nan)}
     if found.decided and "axis" in asked:
-        # the axis of the specimen is seen at the centre of the detector, not at that of the ions
-        axis = (found.best.projection.directions(np.zeros((1, 2))) @ found.best.orientation.matrix)[0]
+        axis = axis_of(found.best)
         answers |= {f"axis {index}": (value, np.nan) for index, value in zip("hkl", axis, strict=True)}
     solutes = [solute for solute in (given["solute"], given["shell"]) if solute]
     known = common(given) | {"radius": radius, "compression": compression}

@@ -5,10 +5,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
+
+import apt_evap as ae
 
 FOLDER = Path(__file__).parents[2] / "benchmarks" / "ground_truth"
 ANSWERS = {
@@ -130,8 +133,6 @@ def test_the_scorer_needs_no_part_of_this_package(truth):
 
 @pytest.mark.parametrize("shell", ["", "Mg"])
 def test_the_shares_of_a_true_ball_and_its_shell_are_found(shell):
-    import apt_evap as ae
-
     random = np.random.default_rng(4)
     places = 5 * random.random((6000, 3))
     around, draw = np.linalg.norm(places - 2.5, axis=1), random.random(len(places))
@@ -166,3 +167,12 @@ def test_the_generator_gives_nothing_away_and_withholds(tmp_path, capsys):
     assert set(answers) == set(asked) and not withheld and len(sites) == n > 1000
     assert 35 < answers["Cu of phase"] < 50 > 3 > answers["Cu of matrix"] > 1
     assert 0.5 <= answers["thickness"] <= 0.7 and 7.0 < answers["apex radius"] < 9.5
+
+
+def test_the_axis_of_an_answer_is_at_the_centre_of_the_detector():
+    orientation = ae.Orientation("Fe", (1, 2, 9), 20.0)
+    along = np.array([1, 2, 9]) / np.sqrt(86)
+    for centre, angle in (((0.0, 0.0), 0.0), ((10.8, 13.9), np.hypot(10.8, 13.9) / 97.7)):
+        candidate = SimpleNamespace(orientation=orientation, projection=ae.detection.Projection(97.7, centre))
+        axis = module("baselines").axis_of(candidate)
+        assert np.arccos(min(1.0, axis @ along)) == pytest.approx(angle, abs=1e-7)
