@@ -36,6 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 _say_how_to_go_on(arguments)
             return TERMINATED if terminated and code == INTERRUPTED else code
         except KeyboardInterrupt:
+            # `python -m` would end itself by SIGINT, whatever the code is, if exec of a text was interrupted, by which
+            # libraries make functions; another text resets this
+            exec("")
             _say_how_to_go_on(arguments)
             return TERMINATED if terminated else INTERRUPTED
         except BrokenPipeError:  # the reader of the output has closed the pipe

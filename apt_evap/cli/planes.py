@@ -69,8 +69,8 @@ def execute(options: argparse.Namespace) -> int:
         factor, error = planes.spacing / true, planes.spacing_error / true
         other = factor**-0.5
         other_error = error * other / (2 * factor)
-        result |= {"efficiency_factor": factor, "efficiency_factor_error": error}
-        result |= {"field_factor_factor": other, "field_factor_factor_error": other_error}
+        result |= {"efficiency_ratio": factor, "efficiency_ratio_error": error}
+        result |= {"field_factor_ratio": other, "field_factor_ratio_error": other_error}
         tell(
             options,
             f"the spacing is {true:g} nm with {factor:.3f} ± {error:.3f} times the efficiency, or with {other:.3f} ± "

@@ -189,7 +189,7 @@ def _completed(settings, measured, run):
     """Settings with a smoothing and a number of draws, which follow from the map and the run."""
     bin_size = max(measured.bin_size) * (0.5 if measured.is_counts else 1)
     smoothing = bin_size if settings.smoothing is None else settings.smoothing
-    return replace(settings, smoothing=smoothing, replicas=settings.replicas or _replicas(measured, run))
+    return replace(settings, smoothing=smoothing, replicas=settings.replicas or draws_per_ion(measured, len(run)))
 
 
 def _registered(search):
@@ -361,7 +361,7 @@ def real_units_of(run: Run) -> dict[str, Any] | None:
     }
 
 
-def _replicas(measured, run):
-    """Number of draws per ion for `DRAWN` times the measured ions; their number is not known for densities."""
-    number = DRAWN * measured.values.sum() / len(run) if measured.is_counts else 2 * FEWEST
+def draws_per_ion(measured: DetectorMap, ions: int) -> int:
+    """Draws of each ion of a run for `DRAWN` times the measured ions; their number is not known for densities."""
+    number = DRAWN * measured.values.sum() / ions if measured.is_counts else 2 * FEWEST
     return int(np.clip(np.ceil(number), FEWEST, MOST))

@@ -162,6 +162,7 @@ def settings_of(
     field_factor: float | None = None,
     minutes: float = 10.0,
     threads: int = 1,
+    spare: float = 1.0,
 ) -> StartSettings:
     """Make the settings of a simulation of a measured specimen.
 
@@ -180,6 +181,9 @@ def settings_of(
         Time that the simulation may take. Its tip is smaller than the measured one if necessary.
     threads : int
         Threads of the simulation.
+    spare : float
+        Times the ions of this time that the settings ask for, for a run that ends with its time (`simulate`). The
+        shape of the tip limits them.
 
     Returns
     -------
@@ -231,6 +235,8 @@ def settings_of(
                 text, needs = _costed(indexing, radii, size, lens, factors, threads, more)
                 if needs.ions == before:
                     break
+            if check_number(spare, "spare", at_least=1) > 1:
+                text, _ = _costed(indexing, radii, size, lens, factors, threads, more * spare)
             break
     else:
         least = math.ceil(600 * (needs.hours or 0.0) / threads) / 10  # 0.1 is not enough where 0.11 is needed

@@ -96,6 +96,7 @@ _GROUPING = ("pulse_id", "multiplicity")
 _OF_PYCCAPT = (*EPOS, *_GROUPING, "start_counter", "laser_pulse", "calibrated_time_of_flight")
 _OF_PYCCAPT += ("uncalibrated_mass_to_charge", "multi")
 _WIDEST, _NARROWEST = 500.0, 1.0  # [mm]: of a detector; those of atom probes have 80 to 120
+_ATOM = 0.1  # nm, smaller than any atom
 _ENOUGH = 100  # ions: fewer may be near each other
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
@@ -217,7 +218,18 @@ def _with_warning_of_size(path, parts):
 
 
 def _warn_of_size(path, content):
-    """Warn if a measured map or ions are farther apart than any detector is wide, or nearer than any is small."""
+    """Warn if a measured map or ions are farther apart than any detector is wide, or nearer than any is small.
+
+    And of positions that are nearer to each other than atoms are.
+    """
+    if isinstance(content, Hits) and content.outcome is None and content.positions is not None:
+        span = _span(content.positions)
+        if 0 < span < _ATOM and len(content) >= _ENOUGH:
+            warn(
+                f"{str(path)!r} has positions within {span:.2g} nm, less than the size of an atom: are they in nm?",
+                DataWarning,
+            )
+            return True
     if isinstance(content, Hits) and content.outcome is None and content.x is not None and content.y is not None:
         size = _size(content, np.isfinite(content.x) & np.isfinite(content.y))
         if max(size) > _WIDEST:  # perhaps by strays alone, which have a warning of their own
@@ -241,6 +253,12 @@ def _warn_of_size(path, content):
             DataWarning,
         )
     return max(size) > _WIDEST
+
+
+def _span(positions):
+    """Largest extent of finite positions along an axis [nm]; 0 if there are none."""
+    finite = positions[np.isfinite(positions).all(axis=1)]
+    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
 
 
 def _size(hits, rows):

@@ -142,10 +142,10 @@ class Recorder:
             self._land()
             self._store()
 
-    def interrupt(self) -> None:
-        """Record that the run ends early."""
+    def end_early(self, reason: StopReason) -> None:
+        """Record that the run ends before its last ion, and why."""
         if self._ending == StopReason.COMPLETE and self.missing:
-            self._ending = StopReason.INTERRUPTED
+            self._ending = reason
 
     def _land(self, backlog=0):
         while len(self._flying) > backlog:

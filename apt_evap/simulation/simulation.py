@@ -5,7 +5,9 @@ surface that replay the events one by one. So each ion flies in exactly the fiel
 threads and any size of a batch.
 """
 
+import math
 import threading
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -18,7 +20,7 @@ from apt_evap._common.ion_random import IonRandom
 from apt_evap._common.memory import check_copies
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
-from apt_evap._common.validation import check_count, check_kind, check_seed, check_sequence, check_switch
+from apt_evap._common.validation import check_count, check_kind, check_number, check_seed, check_sequence, check_switch
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.emissions import Emissions, check_launches
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
@@ -37,6 +39,7 @@ from apt_evap.simulation.history import CapHistory
 from apt_evap.simulation.monitor import Monitor
 from apt_evap.simulation.recorder import Recorder
 from apt_evap.simulation.run import Run
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.specimen.tip import Tip
 from apt_evap.warnings import RunWarning, warn
 
@@ -163,6 +166,7 @@ class Simulation:
         progress: bool | Callable[[int, int], object] | None = None,
         batch_size: int = BATCH,
         checkpoint: Checkpoint | AnyPath | None = None,
+        seconds: float | None = None,
     ) -> Run:
         """Evaporate atoms and fly their ions.
 
@@ -187,6 +191,9 @@ class Simulation:
         checkpoint : Checkpoint or str or path-like, optional
             File in which the run is stored at intervals and at its end; a file name for the default settings. A run
             that is killed and resumed gives the same bits as an uninterrupted one.
+        seconds : float, optional
+            Time after which the run ends with the ions so far, as with Ctrl-C [s]. The ions are the first ones of the
+            whole run, bit by bit; their number depends on the machine.
 
         Returns
         -------
@@ -204,6 +211,9 @@ class Simulation:
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
         check_switch(responses, "responses")
+        ends_at = math.inf
+        if seconds is not None:
+            ends_at = time.monotonic() + check_number(seconds, "seconds", at_least=0, unit="s")
         if progress is not None and not callable(progress):
             check_switch(progress, "progress")
         emissions = check_sequence(emissions, "emissions", "perturbations")
@@ -213,26 +223,26 @@ class Simulation:
         if not emissions and not responses:
             emissions = (Unperturbed(),)
         if checkpoint is None:
-            return self._run(n_ions, emissions, responses, progress, batch_size, None)
+            return self._run(n_ions, emissions, responses, progress, batch_size, None, ends_at)
         if not isinstance(checkpoint, Checkpoint):
             checkpoint = Checkpoint(checkpoint)
         with CheckpointWriter(checkpoint, self.settings, emissions, responses, n_ions) as writer:
-            return self._run(n_ions, emissions, responses, progress, batch_size, writer)
+            return self._run(n_ions, emissions, responses, progress, batch_size, writer, ends_at)
 
     def __reduce__(self):
         raise TypeError("a Simulation cannot be pickled or copied: save its run, and make a new simulation")
 
-    def _run(self, n_ions, emissions, responses, progress, batch_size, writer):
+    def _run(self, *arguments):
         if not self._running.acquire(blocking=False):
             raise ValueError(
                 "a run of this simulation is active in another thread: wait for it, or make another simulation"
             )
         try:
-            return self._run_alone(n_ions, emissions, responses, progress, batch_size, writer)
+            return self._run_alone(*arguments)
         finally:
             self._running.release()
 
-    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer):
+    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer, ends_at):
         self._catch_up(writer.previous if writer else None)
         self.emitter.request_tree_copy()  # atoms may have evaporated without flights before
         if not (writer and writer.previous):
@@ -246,8 +256,8 @@ class Simulation:
             for batch in self.emitter.advance(recorder.missing, batch_size, self._flight_pool.paused):
                 part = self._start_flights(batch, emissions, responses)
                 recorder.add(batch, part, self.n_evaporated, backlog)
-                if interrupted.is_set():
-                    recorder.interrupt()
+                if interrupted.is_set() or time.monotonic() >= ends_at:
+                    recorder.end_early(StopReason.INTERRUPTED if interrupted.is_set() else StopReason.TIME_OVER)
                     break
         return recorder.run
 

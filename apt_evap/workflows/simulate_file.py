@@ -11,7 +11,7 @@ from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
 from apt_evap.analysis.description import real_units_line
-from apt_evap.config.cost_estimate import estimate_cost
+from apt_evap.config.cost_estimate import estimate_cost, hours_text
 from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.config.simulation_settings import Config
 from apt_evap.detection.detector_map import DetectorMap
@@ -89,6 +89,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     checkpoint: float = 10.0,
+    seconds: float | None = None,
     own_classes: bool = False,
     progress: Any = None,
     note: Callable[[str], None] = no_note,
@@ -118,6 +119,8 @@ def simulate(
         Whether to replace unfinished and other runs, and files that were not made by this package.
     checkpoint : float
         Time between two checkpoints [min].
+    seconds : float, optional
+        Time from this call after which the events end, with the ions so far [s].
     own_classes : bool
         Whether modules with classes of one's own are imported, which executes them; as for `read_config`.
     progress : bool or callable, optional
@@ -157,6 +160,7 @@ def simulate(
     >>> len(done.run), done.path.name, done.picture.name
     (100, 'tiny.h5', 'tiny.png')
     """
+    called = time.monotonic()
     config = _config(check_path(settings), own_classes, ions=ions, seed=seed)
     path = check_path(output or config.output or f"{config.path.stem}.h5")
     if path.suffix.lower() != ".h5":
@@ -168,7 +172,10 @@ def simulate(
 
     n_ions = config.n_ions
     cost = estimate_cost(config, 1)
-    note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
+    if seconds is not None:
+        note(f"at most {n_ions:,} ions, as many as {hours_text(seconds / 3600)} allow")
+    else:
+        note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
     note("building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=threads)
     note(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
@@ -178,7 +185,8 @@ def simulate(
     n_previous = stored.ions_there() if resume else 0
     if 0 < n_previous < n_ions:
         note(f"resumed at {n_previous:,} of {n_ions:,} ions")
-    run = _evaporated(config, simulation, stored, n_previous, progress)
+    left = None if seconds is None else max(seconds - (time.monotonic() - called), 0.0)
+    run = _evaporated(config, simulation, stored, n_previous, progress, left)
     seconds = time.perf_counter() - began
     if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
         if picture.exists():
@@ -221,7 +229,9 @@ def _config(settings: Path, own_classes: bool, **changes: int | None) -> Config:
     return config
 
 
-def _evaporated(config: Config, simulation: Simulation, stored: Checkpoint, n_previous: int, progress: Any) -> Run:
+def _evaporated(
+    config: Config, simulation: Simulation, stored: Checkpoint, n_previous: int, progress: Any, seconds: float | None
+) -> Run:
     """The run of a simulation; after an interrupt or an error a warning names the file of its ions."""
     n_ions = config.n_ions
     is_entered = isinstance(progress, contextlib.AbstractContextManager)
@@ -230,7 +240,12 @@ def _evaporated(config: Config, simulation: Simulation, stored: Checkpoint, n_pr
             if callable(shown):
                 shown(n_previous, n_ions)
             return simulation.run(
-                n_ions, config.emissions, responses=config.responses, progress=shown, checkpoint=stored
+                n_ions,
+                config.emissions,
+                responses=config.responses,
+                progress=shown,
+                checkpoint=stored,
+                seconds=seconds,
             )
     except KeyboardInterrupt:
         if ions := stored.ions_there():
@@ -265,5 +280,5 @@ def _note_outcomes(config: Config, run: Run, path: Path, note: Callable[[str], N
     if run.ended == StopReason.INTERRUPTED:
         text = f"interrupted; {len(run):,} of {config.n_ions:,} ions are in {str(path)!r}"
         warn(text, WorkflowWarning, _CONTINUE)
-    elif run.ended:
+    elif run.ended and run.ended != StopReason.TIME_OVER:
         warn(f"the run ended early: {run.ended}; its {len(run):,} ions are saved", WorkflowWarning)

@@ -410,6 +410,18 @@ def test_ctrl_c_and_sigterm_keep_what_is_done(folder, sent, code):
     assert sorted(os.listdir(folder)) == ["small.h5", "small.png", "small.toml"]
 
 
+def test_an_interrupted_exec_of_a_library_does_not_change_the_exit_code(tmp_path):
+    (tmp_path / "program.py").write_text(
+        "import sys\nfrom apt_evap.cli import main\n"
+        "main._execute = lambda _: exec('raise KeyboardInterrupt')\nsys.exit(main.main(['info', 'a']))\n"
+    )
+    environment = os.environ | {"PYTHONPATH": HERE}
+    ended = subprocess.run(
+        [sys.executable, "-m", "program"], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert ended.returncode == 130 and "apt-evap info a" in ended.stderr
+
+
 @pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
     """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""

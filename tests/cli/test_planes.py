@@ -32,11 +32,11 @@ def test_spacing_and_normal_are_found(planes, capsys):
     assert found["tilt"] == pytest.approx(TILT, abs=0.5)  # 0.02 nm over 2.4 nm
     np.testing.assert_allclose(found["normal"], [np.sin(np.radians(6)), 0, np.cos(np.radians(6))], atol=0.01)
     assert found["depth_resolution"] == pytest.approx(0.02, abs=0.006)
-    assert found["efficiency_factor"] == pytest.approx(SPACING / 0.21, rel=0.01)
-    assert found["field_factor_factor"] == pytest.approx((0.21 / SPACING) ** 0.5, rel=0.01)
+    assert found["efficiency_ratio"] == pytest.approx(SPACING / 0.21, rel=0.01)
+    assert found["field_factor_ratio"] == pytest.approx((0.21 / SPACING) ** 0.5, rel=0.01)
     relative = found["spacing_error"] / found["spacing"]
-    assert found["efficiency_factor_error"] == pytest.approx(relative * found["efficiency_factor"])
-    assert found["field_factor_factor_error"] == pytest.approx(relative * found["field_factor_factor"] / 2)
+    assert found["efficiency_ratio_error"] == pytest.approx(relative * found["efficiency_ratio"])
+    assert found["field_factor_ratio_error"] == pytest.approx(relative * found["field_factor_ratio"] / 2)
 
 
 def test_wrong_input_is_one_sentence(planes, capsys):

@@ -119,11 +119,22 @@ def test_less_time_makes_a_smaller_tip(found):
     assert ae.fit.settings_of(indexing, minutes=least).cost.hours * 60 <= least
 
 
+def test_a_run_that_ends_with_its_time_has_spare_ions(found):
+    _, indexing = found
+    usual, spare = (ae.fit.settings_of(indexing, minutes=5, spare=spare) for spare in (1.0, 1.2))
+    assert spare.cost == usual.cost and spare.simulated_radius == usual.simulated_radius
+    ions = [tomllib.loads(start.text)["simulation"]["ions"] for start in (usual, spare)]
+    assert ions[1] == pytest.approx(1.2 * ions[0], rel=1e-3)
+    most = tomllib.loads(ae.fit.settings_of(indexing, minutes=5, spare=1e3).text)["simulation"]["ions"]
+    assert ions[1] < most <= 150_000  # the shape of the tip limits them
+
+
 def test_bad_arguments_are_named(found):
     _, indexing = found
     lens = ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=5.0)
     for name, options in (
         ("minutes", {"minutes": -1}),
+        ("spare", {"spare": 0.5}),
         ("field_factor", {"field_factor": 0}),
         ("threads", {"threads": 0}),
     ):

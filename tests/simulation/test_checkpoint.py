@@ -210,6 +210,19 @@ def test_ctrl_c_saves_the_run_which_can_be_resumed(tmp_path):
     assert differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
 
 
+def test_a_run_whose_time_is_over_has_the_first_ions_and_can_be_resumed(tmp_path):
+    options = {"responses": False, "progress": False, "batch_size": 30}
+    run = small().run(90, checkpoint=tmp_path / "run.h5", seconds=0, **options)  # a batch is never cut
+    assert (run.ended, len(run)) == ("its time was over", 30)
+    small().run(90, checkpoint=ae.simulation.Checkpoint(tmp_path / "run.h5", resume=True), seconds=1000, **options)
+    whole = small().run(90, checkpoint=tmp_path / "whole.h5", **options)
+    assert whole.ended == "" and differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
+    assert small().run(30, seconds=0, **options).ended == ""  # nothing was left to do
+    for wrong in (-1, float("nan"), "1 min"):
+        with pytest.raises(ValueError, match="seconds"):
+            small().run(90, seconds=wrong, **options)
+
+
 def test_a_second_ctrl_c_keeps_what_is_done(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         interrupted(tmp_path / "run.h5", (40, 50))

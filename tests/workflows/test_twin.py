@@ -15,8 +15,10 @@ import apt_evap as ae
 from apt_evap.cli._files import measured_source
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
+from apt_evap.config.simulation_file import read_config
 from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import warn
 from apt_evap.workflows import kept_files, twin_of_map
 from apt_evap.workflows.advice import advice_as_notes
@@ -81,7 +83,8 @@ def quick(tmp_path, monkeypatch, indexed_once):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(twin_of_map, "simulate", simulate)
     monkeypatch.setattr(twin_of_map, "compare", compare)
-    monkeypatch.delattr(twin_of_map, "load")  # the simulated run is in memory
+    whole = SimpleNamespace(ended="", provenance={})
+    monkeypatch.setattr(twin_of_map, "load", lambda path: whole)  # the simulated run is in memory
     monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
     monkeypatch.setattr(twin_of_map, "index", index)
     monkeypatch.setattr(twin_of_map, "register_near", lambda *_: ae.Registration(1.0, 1.0, (0.0, 0.0)))
@@ -142,6 +145,38 @@ def test_files_that_this_command_did_not_write_are_refused(quick, capsys, name, 
     (tmp_path / "t" / RECORD).unlink()
     capsys.readouterr()
     assert "t/specimen.toml" in refused(capsys, *first)
+
+
+@pytest.mark.slow
+def test_a_run_whose_time_was_over_is_not_continued_unless_it_is_another(quick, capsys, monkeypatch):
+    first = ["ni.epos", *ARGUMENTS, "-o", "t"]
+    assert main(["twin", *first]) == 0
+    quick.clear()
+    key = read_config("t/specimen.toml").key
+    for provenance, steps in (({"settings": key}, []), ({"settings": "of another file"}, ["run"]), ({}, ["run"])):
+        left = SimpleNamespace(ended=StopReason.TIME_OVER, provenance=provenance)
+        monkeypatch.setattr(twin_of_map, "load", lambda path, left=left: left)
+        assert main(["twin", *first]) == 0
+        assert quick == steps
+        quick.clear()
+
+
+@pytest.mark.slow
+def test_the_simulation_leaves_time_for_the_fit(quick, monkeypatch):
+    seconds = []
+    simulate = twin_of_map.simulate
+
+    def timed(settings, output, **options):
+        seconds.append(options["seconds"])
+        return simulate(settings, output)
+
+    monkeypatch.setattr(twin_of_map, "simulate", timed)
+    for minutes, threads in ((10, 1), (10, 2), (1, 1)):
+        ae.twin("ni.epos", "Ni", scales=(56, 64), minutes=minutes, threads=threads, folder=f"t{minutes}{threads}")
+    one, two, short = seconds
+    # 6,000 measured ions: four draws per ion, whose fit takes 0.36 of the time of the simulation, and 45 s beside it
+    assert one == pytest.approx((600 - 45) / 1.36, abs=60) and two - one == pytest.approx(22.5 / 1.36, abs=60)
+    assert short == 12  # a fifth at least
 
 
 def test_a_folder_of_others_stays_as_it_is(quick, capsys, tmp_path):

@@ -13,6 +13,7 @@ import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.io import measured_file
 from apt_evap.plot.report.html_page import read_report
+from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import WorkflowWarning
 from apt_evap.workflows import compare_maps
 
@@ -65,6 +66,16 @@ def test_a_simulated_file_is_extended_and_nobody_elses_is_replaced(folder):
         ae.simulate("small.toml", progress=False)
     assert Path("small.h5").read_text() == "precious"
     assert len(ae.simulate("small.toml", overwrite=True, ions=5, progress=False).run) == 5
+
+
+@NO_PICTURES
+@pytest.mark.filterwarnings("error")
+def test_a_simulation_ends_when_its_time_is_over(folder):
+    lines = []
+    ended = ae.simulate("small.toml", ions=600, seconds=0, progress=False, note=lines.append)
+    assert ended.run.ended == StopReason.TIME_OVER and not ended.interrupted
+    assert 0 < len(ended.run) < 600 and lines[0] == "at most 600 ions, as many as 0 min allow"
+    assert ae.load("small.h5").fingerprint() == ended.run.fingerprint()
 
 
 @pytest.mark.slow
