@@ -117,6 +117,7 @@ def _simulated(tips, sequence):
         run = Simulation(tip, seed=1, rule=ConstantPotential()).run(
             min(total, len(tip.positions)), [Unperturbed()], responses=False, progress=False
         )
+        run.unless_interrupted()
         if compression is None:
             compression = image_compression(run).compression
         hits = run.hits(Unperturbed())

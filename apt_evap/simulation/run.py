@@ -26,6 +26,7 @@ from apt_evap.simulation.parts_of_runs import join_parts, select_rows
 from apt_evap.simulation.real_units import OperatingPoint, RealUnits, real_units_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
 from apt_evap.simulation.run_table import RunTable
+from apt_evap.simulation.stop_reason import StopReason
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -397,6 +398,18 @@ class Run(RunTable):
             check_kind(run, f"runs[{number}]", Run, "a Run")
         joined = join_parts(runs)
         return replace(runs[0], **joined)
+
+    def unless_interrupted(self) -> "Run":
+        """The run itself, for a step that needs all of its ions.
+
+        Raises
+        ------
+        KeyboardInterrupt
+            If Ctrl-C ended the run.
+        """
+        if self.ended == StopReason.INTERRUPTED:
+            raise KeyboardInterrupt
+        return self
 
     def ended_by(self, reason: str) -> "Run":
         """The same run with the reason of an early end."""

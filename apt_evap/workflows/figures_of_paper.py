@@ -175,7 +175,7 @@ def _response(case, radius, threads):
     emitter = Emitter(tip)
     atoms = _chosen(emitter)
     simulation = Simulation(tip, seed=1, law=_ChosenFirst(atoms), n_threads=threads)
-    run = simulation.run(len(atoms), progress=False)
+    run = simulation.run(len(atoms), progress=False).unless_interrupted()
     return emitter, run, [int(np.flatnonzero(run.site == atom)[0]) for atom in atoms]
 
 

@@ -174,3 +174,15 @@ def test_the_name_of_a_module_occurs_once():
     """But for the commands, each in a module of its name."""
     names = [path.stem for path in PACKAGE.rglob("*.py") if path.parent.name != "cli" and path.stem != "__init__"]
     assert {name for name in names if names.count(name) > 1} == set()
+
+
+def test_nobody_goes_on_with_an_interrupted_run():
+    """Ctrl-C ends `Simulation.run` with the ions so far: who asks for a run says what becomes of it then."""
+    asking = re.compile(r"[sS]imulation\([^\n]*\)\.run\(|\bsimulation\.run\(")
+    handling = re.compile(r"\.unless_interrupted\(\)|StopReason\.INTERRUPTED")
+    callers = {}
+    for path in PACKAGE.rglob("*.py"):
+        code = "\n".join(line for line in path.read_text().splitlines() if not re.match(r"\s*(>>>|\.\.\.) ", line))
+        if asking.search(code) and '"pass it to the simulation' not in code:
+            callers[path.relative_to(PACKAGE).as_posix()] = bool(handling.search(code))
+    assert len(callers) >= 6 and all(callers.values()), callers

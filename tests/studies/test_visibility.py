@@ -177,6 +177,20 @@ def test_saved_operators_draw_the_same_ions(operators, tmp_path):
     assert loaded.settings == operators.settings and loaded.depth == operators.depth
 
 
+def test_operators_are_not_made_of_an_interrupted_run(tip, monkeypatch):
+    """Ctrl-C ends a run with the ions so far, which are too few."""
+    run, calls = ae.Simulation.run, []
+
+    def interrupted(self, n_ions, *arguments, **options):
+        calls.append(n_ions)
+        return run(self, 50, *arguments, **options).ended_by("interrupted")
+
+    monkeypatch.setattr(ae.Simulation, "run", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        ae.studies.origin_operators(particle(0.5), tip, EVERYTHING, axes={"size": [0.4, 0.5]}, n_threads=1)
+    assert len(calls) == 1
+
+
 def test_a_foreign_file_has_no_operators(tmp_path):
     path = tmp_path / "other.h5"
     path.write_bytes(b"nothing")

@@ -20,7 +20,6 @@ from apt_evap._common.locks import open_lock, try_lock
 from apt_evap._common.types import AnyPath
 from apt_evap.config.simulation_file import config_of, key_of, read_document
 from apt_evap.simulation.checkpoint import Checkpoint
-from apt_evap.simulation.stop_reason import StopReason
 
 SETTINGS, RUN, WORK, LOCK = "settings.toml", "run.h5", "work.json", "lock"
 """Files of a point."""
@@ -156,9 +155,7 @@ def _run(folder, threads, checkpoint):
         progress=False,
         checkpoint=Checkpoint(folder / RUN, checkpoint, resume=True),
     )
-    if run.ended == StopReason.INTERRUPTED:
-        raise KeyboardInterrupt
-    config.as_saved(run).save(folder / RUN)
+    config.as_saved(run.unless_interrupted()).save(folder / RUN)
 
 
 def _planned(path):

@@ -144,7 +144,8 @@ def simulated(
     simulation = Simulation(tip, seed=seed, n_threads=n_threads, **settings)
     # energies are those at the evaporation field: flights with perturbations need the responses of the run
     rest = perturbation is None or perturbation == Unperturbed()
-    return simulation.run(ions, [Unperturbed()] if rest else [], responses=not rest, progress=False)
+    run = simulation.run(ions, [Unperturbed()] if rest else [], responses=not rest, progress=False)
+    return run.unless_interrupted()
 
 
 def depth_for(feature: Phase, specimen: Mapping[str, Any], nodes: list[dict[str, float]]) -> float:
