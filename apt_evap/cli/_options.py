@@ -116,7 +116,7 @@ def add_specimen(parser: argparse.ArgumentParser) -> Any:
         type=float,
         default=10.0,
         metavar="N",
-        help="time: of all that twin does, of the simulation that start writes; more for a larger tip; default: 10",
+        help="time of all that twin does, or of the simulation that start writes; default: 10",
     )
     group.add_argument("--field-factor", type=float, metavar="KF", help="for the radius from the voltage; default: 3.3")
     group.add_argument("--lens", metavar="L", help="microscope that gives the field factor, as for apt-evap export")

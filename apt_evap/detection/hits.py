@@ -152,7 +152,7 @@ class Hits:
         values["extra"] = {name: _extra(name, value) for name, value in values["extra"].items()}
         check_kind(self.source, "source", str, "text")
         if self.ranges is not None:
-            check_kind(self.ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
+            check_kind(self.ranges, "ranges", "species", "Ranges, such as ae.io.read_ranges(path)")
         if self.extent is not None:
             check_array(self.extent, "extent", (4,))
         lengths.update((name, len(column)) for name, column in values["extra"].items())

@@ -130,7 +130,7 @@ class PointCloud:
         places = check_array(places, "positions", (len(ions), 3), finite=False)
         composition = None
         if ranges is not None:
-            check_kind(ranges, "ranges", "species", "Ranges, such as read_ranges(path)")
+            check_kind(ranges, "ranges", "species", "Ranges, such as ae.io.read_ranges(path)")
             names, species = ranges.species_names, ranges.species(ions)
             first = {name: atoms for name, atoms in zip(ranges.names[::-1], ranges.composition[::-1], strict=True)}
             composition = tuple(first[name] or {name: 1} for name in names)

@@ -100,7 +100,7 @@ def reconstruct(
     """
     check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")
     if ranges is not None:
-        check_kind(ranges, "ranges", Ranges, "Ranges, such as read_ranges(path)")
+        check_kind(ranges, "ranges", Ranges, "Ranges, such as ae.io.read_ranges(path)")
     if origins is not None:
         check_kind(origins, "origins", OriginTable, "an OriginTable, such as origin_table(runs)")
     chosen = check_choice(shape, "shape", SHAPES)
