@@ -91,7 +91,9 @@ def reconstruction(
 def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str], Integers]:
     """Names of the groups of ions, the most frequent first, and the group of each ion."""
     if ranges is not None:
-        labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as ae.io.read_ranges(path)").labels(result.hits, OUTSIDE)
+        labels = check_kind(ranges, "ranges", Ranges, "Ranges, such as ae.io.read_ranges(path)").labels(
+            result.hits, OUTSIDE
+        )
     elif "element" in result.hits.extra:
         labels = result.hits.extra["element"]
     else:
