@@ -39,6 +39,8 @@ FIELD_FACTOR = 3.3
 """Field factor if there is no lens."""
 FIELD_FACTORS = 2.0, 8.0
 """Range of the field factors of usual specimens (Gault et al., Atom Probe Microscopy)."""
+FEWEST_IONS = 10_000
+"""Ions that settings ask for at least."""
 RADII = (80, 60, 50, 40, 32, 25, 20, 16, 12, 10)
 """Radii of simulated tips [lattice constants], the largest one that the time allows is taken."""
 _CONTENT = "SHA-256 of its content: "  # of the measured file
@@ -51,7 +53,7 @@ _VOLTAGE = 1000.0  # V, of a simulation
 # eV at this voltage: the default of responses, and where they are exact: of 3,000 ions of nickel with R = 16 a none is
 # flagged with 5 eV, 1,956 with 12.7
 _LIMITS = 1.5, 5.0
-_FEWEST, _MOST = 10_000, 150_000  # ions
+_MOST = 150_000  # ions
 _FILLED = 0.95  # of the time that is used at least, if the bounds of the ions allow it
 
 
@@ -296,7 +298,7 @@ def _text(indexing, radii, size, lens, factors, more):
     material, projection = best.orientation.material, best.projection
     atoms = atom_density(material.structure, material.a, material.c) * material.a**3
     layers = 2 * math.pi * atoms * size**2 * more  # a lattice constant of the cap
-    ions = int(min(max(layers, _FEWEST), _PART * 2 / 3 * math.pi * atoms * size**3, _MOST))
+    ions = int(min(max(layers, FEWEST_IONS), _PART * 2 / 3 * math.pi * atoms * size**3, _MOST))
     disc = disc_of(indexing.map)
     x, y = np.meshgrid(*indexing.map.centres)
     reach = np.hypot(x - disc.centre[0], y - disc.centre[1])[disc.map.mask].max()

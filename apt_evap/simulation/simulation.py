@@ -5,7 +5,6 @@ surface that replay the events one by one. So each ion flies in exactly the fiel
 threads and any size of a batch.
 """
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -167,6 +166,7 @@ class Simulation:
         batch_size: int = BATCH,
         checkpoint: Checkpoint | AnyPath | None = None,
         seconds: float | None = None,
+        fewest: int = 1,
     ) -> Run:
         """Evaporate atoms and fly their ions.
 
@@ -194,6 +194,8 @@ class Simulation:
         seconds : float, optional
             Time after which the run ends with the ions so far, as with Ctrl-C [s]. The ions are the first ones of the
             whole run, bit by bit; their number depends on the machine.
+        fewest : int
+            Ions before which this time does not end the run.
 
         Returns
         -------
@@ -211,9 +213,7 @@ class Simulation:
         n_ions = check_count(n_ions, "n_ions", at_least=1)
         batch_size = check_count(batch_size, "batch_size", at_least=1)
         check_switch(responses, "responses")
-        ends_at = math.inf
-        if seconds is not None:
-            ends_at = time.monotonic() + check_number(seconds, "seconds", at_least=0, unit="s")
+        time_over = _time_limit(seconds, fewest)
         if progress is not None and not callable(progress):
             check_switch(progress, "progress")
         emissions = check_sequence(emissions, "emissions", "perturbations")
@@ -223,11 +223,11 @@ class Simulation:
         if not emissions and not responses:
             emissions = (Unperturbed(),)
         if checkpoint is None:
-            return self._run(n_ions, emissions, responses, progress, batch_size, None, ends_at)
+            return self._run(n_ions, emissions, responses, progress, batch_size, None, time_over)
         if not isinstance(checkpoint, Checkpoint):
             checkpoint = Checkpoint(checkpoint)
         with CheckpointWriter(checkpoint, self.settings, emissions, responses, n_ions) as writer:
-            return self._run(n_ions, emissions, responses, progress, batch_size, writer, ends_at)
+            return self._run(n_ions, emissions, responses, progress, batch_size, writer, time_over)
 
     def __reduce__(self):
         raise TypeError("a Simulation cannot be pickled or copied: save its run, and make a new simulation")
@@ -242,7 +242,7 @@ class Simulation:
         finally:
             self._running.release()
 
-    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer, ends_at):
+    def _run_alone(self, n_ions, emissions, responses, progress, batch_size, writer, time_over):
         self._catch_up(writer.previous if writer else None)
         self.emitter.request_tree_copy()  # atoms may have evaporated without flights before
         if not (writer and writer.previous):
@@ -256,7 +256,7 @@ class Simulation:
             for batch in self.emitter.advance(recorder.missing, batch_size, self._flight_pool.paused):
                 part = self._start_flights(batch, emissions, responses)
                 recorder.add(batch, part, self.n_evaporated, backlog)
-                if interrupted.is_set() or time.monotonic() >= ends_at:
+                if interrupted.is_set() or time_over(n_ions - recorder.missing):
                     recorder.end_early(StopReason.INTERRUPTED if interrupted.is_set() else StopReason.TIME_OVER)
                     break
         return recorder.run
@@ -404,3 +404,12 @@ class Simulation:
             "control": to_plain(self.control),
             "pulse_length": self.emitter.pulse_length,
         }
+
+
+def _time_limit(seconds, fewest):
+    """Whether the time of a run is over, as a function of the number of its ions; it begins now."""
+    fewest = check_count(fewest, "fewest", at_least=1)
+    if seconds is None:
+        return lambda ions: False
+    ends_at = time.monotonic() + check_number(seconds, "seconds", at_least=0, unit="s")
+    return lambda ions: ions >= fewest and time.monotonic() >= ends_at

@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,7 @@ def simulate(
     overwrite: bool = False,
     checkpoint: float = 10.0,
     seconds: float | None = None,
+    fewest: int = 1,
     own_classes: bool = False,
     progress: Any = None,
     note: Callable[[str], None] = no_note,
@@ -121,6 +122,8 @@ def simulate(
         Time between two checkpoints [min].
     seconds : float, optional
         Time from this call after which the events end, with the ions so far [s].
+    fewest : int
+        Ions before which this time does not end the events.
     own_classes : bool
         Whether modules with classes of one's own are imported, which executes them; as for `read_config`.
     progress : bool or callable, optional
@@ -186,7 +189,7 @@ def simulate(
     if 0 < n_previous < n_ions:
         note(f"resumed at {n_previous:,} of {n_ions:,} ions")
     left = None if seconds is None else max(seconds - (time.monotonic() - called), 0.0)
-    run = _evaporated(config, simulation, stored, n_previous, progress, left)
+    run = _evaporated(config, simulation, stored, n_previous, progress, {"seconds": left, "fewest": fewest})
     seconds = time.perf_counter() - began
     if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
         if picture.exists():
@@ -230,7 +233,12 @@ def _config(settings: Path, own_classes: bool, **changes: int | None) -> Config:
 
 
 def _evaporated(
-    config: Config, simulation: Simulation, stored: Checkpoint, n_previous: int, progress: Any, seconds: float | None
+    config: Config,
+    simulation: Simulation,
+    stored: Checkpoint,
+    n_previous: int,
+    progress: Any,
+    limit: Mapping[str, Any],
 ) -> Run:
     """The run of a simulation; after an interrupt or an error a warning names the file of its ions."""
     n_ions = config.n_ions
@@ -245,7 +253,7 @@ def _evaporated(
                 responses=config.responses,
                 progress=shown,
                 checkpoint=stored,
-                seconds=seconds,
+                **limit,
             )
     except KeyboardInterrupt:
         if ions := stored.ions_there():

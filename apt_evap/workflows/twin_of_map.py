@@ -33,7 +33,7 @@ from apt_evap.fit.indexed_registration import (
     registration_start,
 )
 from apt_evap.fit.measured_constants import Measurement, constants_of
-from apt_evap.fit.start_settings import StartSettings, settings_of
+from apt_evap.fit.start_settings import FEWEST_IONS, StartSettings, settings_of
 from apt_evap.fit.study import Study
 from apt_evap.io.formats import read_ranges
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -200,8 +200,10 @@ class Twin:
         if os.path.lexists(path) and not is_run(path):
             raise FileError(f"{str(path)!r} is not a run: remove it, or give another folder with -o (folder=...)")
         config = read_config(self.folder / SETTINGS)
-        if not (path.exists() and _ended_in_time(load(path), config.key)):
-            self._make_run(path, ends_at, draws_per_ion(self.measured_map, config.n_ions))
+        earlier = load(path) if path.exists() else None
+        if earlier is None or not _ended_in_time(earlier, config.key):
+            whole = earlier is not None and earlier.ended == StopReason.COMPLETE
+            self._make_run(path, None if whole else self._seconds(ends_at, config.n_ions))
         told: list[str] = []
         if not (kept.has(REGISTRATION) and kept.has(ANSWER) and kept.has(_REPORT)):
             if not kept.has(REGISTRATION):
@@ -215,16 +217,21 @@ class Twin:
         self._note("\n".join(line for line in self.answer if line not in told))
         self._note(f"wrote {self.report()}")
 
-    def _make_run(self, path, ends_at, draws):
-        """Simulate until the time is over that the fit leaves, or until the tip has evaporated as far as it may."""
-        threads = thread_count(self._threads)
-        left = ends_at - time.monotonic() - _FIT / threads
+    def _seconds(self, ends_at, ions):
+        """Time of the simulation [s], which leaves that of the fit."""
+        left = ends_at - time.monotonic() - _FIT / thread_count(self._threads)
+        left /= 1 + _FIT_PER_DRAW * draws_per_ion(self.measured_map, ions)
+        return max(left, _LEAST_PART * 60 * self._options.minutes)
+
+    def _make_run(self, path, seconds):
+        """Simulate until this time is over, or until the tip has evaporated as far as it may."""
         with advice_as_notes(self._note):
             simulated = simulate(
                 self.folder / SETTINGS,
                 path,
-                threads=threads,
-                seconds=max(left / (1 + _FIT_PER_DRAW * draws), _LEAST_PART * 60 * self._options.minutes),
+                threads=self._threads,
+                seconds=seconds,
+                fewest=FEWEST_IONS,
                 resume=True,
                 progress=self._progress,
                 note=self._note,
