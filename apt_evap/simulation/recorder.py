@@ -10,8 +10,8 @@ from apt_evap._common.progress import progress_bar
 from apt_evap._core.evaporation import EXHAUSTED, SWEEP_DUE
 from apt_evap.evaporation.emitter import Batch, Emitter
 from apt_evap.simulation.checkpoint import CheckpointWriter
-from apt_evap.simulation.history import History
 from apt_evap.simulation.monitor import Monitor, MonitorState
+from apt_evap.simulation.packed_parts import PackedParts
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
 
@@ -89,13 +89,17 @@ class Recorder:
         writer: CheckpointWriter | None,
     ) -> None:
         self._emitter, self._n_ions, self._writer = emitter, n_ions, writer
-        self._stored = [writer.previous] if writer and writer.previous else []
-        self._new, self._latest, self._flying = [], [], []
-        self._state = self._stored[0].state if self._stored else None
-        self._first_event = self._stored[0].first_event if self._stored else emitter.counts["events"]
+        self._parts, self._latest, self._flying = PackedParts(), [], []
+        previous = [writer.previous] if writer and writer.previous else []
+        for run in previous:
+            self._parts.add(run)
+        self._state = previous[0].state if previous else None
+        self._first_event = previous[0].first_event if previous else emitter.counts["events"]
         self._started = len(self)
         interval = settings.interval or 10 * emitter.sweep_interval
-        self._monitor = MonitorState(settings, interval, n_evaporated - len(self), self._stored)
+        self._monitor = MonitorState(settings, interval, n_evaporated - len(self), previous)
+        if writer:
+            writer.previous = None  # its ions are in the parts
         self._ending = StopReason.COMPLETE
         self._report = progress if callable(progress) else None
         self._bar = progress_bar(
@@ -109,7 +113,7 @@ class Recorder:
         self.run: Run | None = None
 
     def __len__(self) -> int:
-        return sum(map(len, (*self._stored, *self._new, *self._latest)))
+        return len(self._parts) + sum(map(len, self._latest))
 
     @property
     def missing(self) -> int:
@@ -161,24 +165,22 @@ class Recorder:
 
     def _gather(self):
         if self._latest:
-            self._new.append(Run.join(self._latest))
+            self._parts.add(Run.join(self._latest))
             self._latest = []
 
-    def _all(self, ended):
-        """All ions so far as one run, with the last state whose events are all among them."""
+    def _all(self, ended, last=False):
+        """All ions so far as one run, with the last state whose events are all among them; the parts end if `last`."""
         self._gather()
-        run = Run.join([*self._stored, *self._new])
-        history = History.join([run.history, self._monitor.pop_history()])  # each check is returned once
-        run = replace(run, history=history)
-        self._stored, self._new = [run], []
+        self._parts.add_history(self._monitor.pop_history())  # each check is returned once
+        run = self._parts.run(last=last)
         state = self._emitter.state()
         if len(state.sites) <= self._first_event + len(run):
             self._state = state
         return replace(run, state=self._state, first_event=self._first_event, ended=str(ended))
 
-    def _store(self):
+    def _store(self, last=False):
         if self._writer and len(self):
-            self._writer.write(self._all(self._ending))
+            self._writer.write(self._all(self._ending, last))
 
     # ---- the context -----------------------------------------------------------------------------------------------
 
@@ -199,12 +201,12 @@ class Recorder:
             elif isinstance(error, Exception):
                 self._fail(error)
             else:  # the second Ctrl-C: write a last checkpoint
-                self._store()
+                self._store(last=True)
         finally:
             self._bar.close()
 
     def _finish(self):
-        self.run = self._all(self._ending)
+        self.run = self._all(self._ending, last=True)
         if self._writer and not self._writer.complete:
             try:
                 self._writer.finish(self.run)
@@ -219,8 +221,10 @@ class Recorder:
             self._flying.clear()
         if not len(self):
             return
-        self.run = self._all(f"{type(error).__name__}: {error}")
-        self._store()
+        self.run = self._all(f"{type(error).__name__}: {error}", last=True)
+        if self._writer:
+            self._writer.write(self.run)
         raise RunInterrupted(
-            f"{type(error).__name__}: {error}; the attribute `run` contains the {len(self):,} ions before it", self.run
+            f"{type(error).__name__}: {error}; the attribute `run` contains the {len(self.run):,} ions before it",
+            self.run,
         ) from error

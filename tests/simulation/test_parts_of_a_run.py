@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 
 import apt_evap as ae
 from apt_evap import Run
+from apt_evap.simulation.columns import columns_of
+from apt_evap.simulation.packed_parts import PackedParts
 
 ROLLED = ae.RollUp(0.1)
 LENS = ae.detection.LocalElectrode.preset("local electrode")
@@ -135,3 +138,58 @@ def test_masked_rows_are_refused(run20):
         with pytest.raises(ValueError, match="rows"):
             run20[rows]
     assert len(run20[np.ma.array(mask)]) == mask.sum()
+
+
+def bits_of(run):
+    """Bytes of each column of a run."""
+    return {path: (values.dtype.str, values.tobytes()) for path, values in columns_of(run, run.every_column).items()}
+
+
+@pytest.mark.parametrize("cuts", [(0, 150), (0, 1, 80, 150), (0, 0, 150, 150)])
+def test_packed_parts_are_the_parts_bit_by_bit(run, cuts):
+    parts = [run[a:b] for a, b in itertools.pairwise(cuts)]
+    packed = PackedParts()
+    for part in parts:
+        packed.add(part)
+    joined = Run.join(parts)
+    for last in (False, True):
+        assert len(packed) == 150
+        unpacked = packed.run(last=last)
+        assert bits_of(unpacked) == bits_of(joined)
+        assert unpacked.fingerprint() == run.fingerprint()
+        for name in ("history", "cap", "provenance", "settings", "perturbations", "elements", "state", "first_event"):
+            assert repr(getattr(unpacked, name)) == repr(getattr(joined, name)), name
+    assert len(packed) == 0
+
+
+def test_packed_parts_keep_every_bit_of_a_number(run):
+    """Not a number has many bits, and zero has a sign."""
+    site = run.responses.site.copy()
+    site[:3, 0, 0] = np.array([0x7FC00001, 0xFFC12345, 0x80000000], np.uint32).view(np.float32)
+    packed = PackedParts()
+    packed.add(replace(run, responses=replace(run.responses, site=site)))
+    assert packed.run(last=True).responses.site.tobytes() == site.tobytes()
+
+
+def test_ions_of_packed_parts_take_less_than_four_fifths_of_a_kilobyte(run):
+    packed = PackedParts()
+    packed.add(run)
+    size = sum(len(part.memory) for part in packed._parts) / len(run)
+    whole = sum(values.nbytes for values in columns_of(run, run.every_column).values()) / len(run)
+    assert size < 800 < 1400 < whole
+
+
+def test_packed_parts_are_joined_without_a_second_copy(run20):
+    """Joining needs the memory of the run, beside that of the packed parts, which is not traced."""
+    whole = sum(values.nbytes for values in columns_of(run20, run20.every_column).values())
+    peaks = []
+    for last in (True, False):
+        packed = PackedParts()
+        for start in range(0, len(run20), 1500):
+            packed.add(run20[start : start + 1500])
+        tracemalloc.start()
+        packed.run(last=last)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert len(packed) == (0 if last else len(run20))
+    assert max(peaks) < 1.3 * whole
