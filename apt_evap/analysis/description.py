@@ -10,6 +10,7 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.orientation_check import apex_sphere, depths, pointing, upright
 from apt_evap.specimen.tip import Tip
@@ -289,32 +290,92 @@ def _tip(settings):
 
 
 def _of_hits(hits):
-    columns = {}
-    for name in hits.columns:
-        values = getattr(hits, name)
-        parts = (
-            {name: values} if values.ndim == 1 else {f"position_{axis}": values[:, k] for k, axis in enumerate("xyz")}
-        )
-        columns |= {key: _extent(part) for key, part in parts.items()}
+    summary = _IonSummary()
+    summary.add(hits)
     detected = hits.detected
-    measured = hits.outcome is None
-    contents = {"kind": "measured ions" if measured else hits.source, "ions": len(hits)}
-    contents |= {"detected": int(np.count_nonzero(detected)), "columns": columns}
-    if measured:
-        contents["absent_or_zero_throughout"] = [
-            name for name in _MEASURED if name not in hits.columns or not np.any(getattr(hits, name))
-        ]
-    if hits.x is not None and hits.y is not None and detected.any():
-        x, y = hits.x[detected], hits.y[detected]
-        contents["detector_extent"] = [_plain(np.ptp(x)), _plain(np.ptp(y))]
-        quantisations = find_quantisations(x, y)
-        contents["detector_quantum"] = (
-            None if quantisations is None else [_plain(quantisation.spacing) for quantisation in quantisations]
-        )
-    if hits.multiplicity is not None:
-        contents["multi_hit_share"] = _plain(np.mean(hits.multiplicity > 1))
-        contents["largest_multi_hit"] = int(hits.multiplicity.max())
-    return contents
+    return summary.contents(None if hits.x is None or hits.y is None else (hits.x[detected], hits.y[detected]))
+
+
+def describe_blocks(ions: IonBlocks) -> dict[str, Any]:
+    """Summarise ions that are read block by block, as `describe`."""
+    summary = ions.fed(_IonSummary)
+    return summary.contents(None if ions.field is None else ions.sample)
+
+
+class _IonSummary:
+    """Summary of ions, all at once or block by block."""
+
+    def __init__(self) -> None:
+        self._extents: dict[str, list[Any]] = {}
+        self._filled: set[str] = set()
+        self._names: tuple[str, ...] = ()
+        self._ions = self._detected = self._multiple = self._largest = 0
+        self._places: list[list[Any]] = []
+        self._first: Hits | None = None
+
+    def add(self, hits: Hits) -> None:
+        """Take the next ions."""
+        if self._first is None:
+            self._names, self._first = hits.columns, hits[:0]
+        for name in self._names:
+            values = getattr(hits, name)
+            parts = {name: values} if values.ndim == 1 else _parts_of_positions(values)
+            for key, part in parts.items():
+                _widen(self._extents.setdefault(key, []), part)
+            if name not in self._filled and (values[:64].any() or values.any()):
+                self._filled.add(name)
+        detected = hits.detected
+        self._ions += len(hits)
+        self._detected += int(np.count_nonzero(detected))
+        if hits.x is not None and hits.y is not None and detected.any():
+            whole = detected.all()
+            self._places = self._places or [[], []]
+            for extent, values in zip(self._places, (hits.x, hits.y), strict=True):
+                _widen(extent, values if whole else values[detected])
+        if hits.multiplicity is not None:
+            self._multiple += int(np.count_nonzero(hits.multiplicity > 1))
+            self._largest = max(self._largest, int(hits.multiplicity.max()))
+
+    def contents(self, places: Sequence[Floats] | None) -> dict[str, Any]:
+        """The summary, with the coordinates of the detected ions, or of a sample of them."""
+        first = self._first
+        assert first is not None
+        measured = first.outcome is None
+        contents = {"kind": "measured ions" if measured else first.source, "ions": self._ions}
+        columns = {key: [_plain(low), _plain(high)] if low <= high else None for key, (low, high) in self._ends()}
+        contents |= {"detected": self._detected, "columns": columns}
+        if measured:
+            contents["absent_or_zero_throughout"] = [name for name in _MEASURED if name not in self._filled]
+        if self._places and places is not None:
+            contents["detector_extent"] = [_plain(high - low) for low, high in self._places]
+            quantisations = find_quantisations(*places)
+            contents["detector_quantum"] = (
+                None if quantisations is None else [_plain(quantisation.spacing) for quantisation in quantisations]
+            )
+        if "multiplicity" in self._names:
+            contents["multi_hit_share"] = _plain(self._multiple / self._ions)
+            contents["largest_multi_hit"] = self._largest
+        return contents
+
+    def _ends(self):
+        return ((key, extent or (1, 0)) for key, extent in self._extents.items())
+
+
+def _parts_of_positions(values):
+    return {f"position_{axis}": values[:, k] for k, axis in enumerate("xyz")}
+
+
+def _widen(extent, values):
+    """Widen an extent, of two numbers, by the finite ones of some values."""
+    if not len(values):
+        return
+    low, high = values.min(), values.max()
+    if not (np.isfinite(low) and np.isfinite(high)):
+        values = values[np.isfinite(values)]
+        if not len(values):
+            return
+        low, high = values.min(), values.max()
+    extent[:] = (min(low, extent[0]), max(high, extent[1])) if extent else (low, high)
 
 
 def _extent(values):
@@ -325,4 +386,4 @@ def _extent(values):
 
 def _plain(value):
     """Number with six digits; integers unchanged."""
-    return int(value) if isinstance(value, np.integer) else float(f"{value:.6g}")
+    return int(value) if isinstance(value, np.integer) else float(f"{value:.6g}") + 0.0

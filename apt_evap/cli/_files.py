@@ -4,10 +4,12 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from apt_evap._common.codec import declared, from_plain
 from apt_evap._common.files import FileError, read_small_file
 from apt_evap.cli._output import say
+from apt_evap.cli._progress import reading_progress
 from apt_evap.config.lens_text import read_lens
 from apt_evap.config.material_text import read_material
 from apt_evap.detection.detector_map import DetectorMap
@@ -40,6 +42,13 @@ def file_of(options: argparse.Namespace) -> MeasuredFile:
 def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
     """Read the FILE of a command, and remove its distortion if the options have a calibration grid."""
     return file_of(options).load(_read)
+
+
+def blocks_of(options: argparse.Namespace, columns: tuple[str, ...] | None = None, passes: int = 2) -> Any:
+    """Blocks of the ions of a large FILE that are read a number of times, with progress; None for other files."""
+    if options.file.endswith(".unfinished"):
+        return None
+    return file_of(options).blocks(columns, reading_progress(passes, quiet=getattr(options, "quiet", False)))
 
 
 def _read(path, **options):

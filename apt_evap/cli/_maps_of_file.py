@@ -7,7 +7,7 @@ from typing import Any
 
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
-from apt_evap.cli._files import file_of, in_real_units, note, read
+from apt_evap.cli._files import blocks_of, file_of, in_real_units, note, read
 from apt_evap.cli._output import say, tell
 from apt_evap.config.material_text import read_material
 from apt_evap.config.perturbation_text import read_perturbation
@@ -16,7 +16,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import index
 from apt_evap.maps.indexing.orientation_search import disc_of
-from apt_evap.plot.map_figures import binned, default_smoothing, specimen_title
+from apt_evap.plot.map_figures import binned, binned_blocks, default_smoothing, specimen_title
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
 from apt_evap.workflows.maps_of_run import run_maps, settings_of_maps
@@ -26,6 +26,8 @@ _IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 
 
 def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[str], str | None, Any]:
     """Maps of the file of a command, their titles, the title of their picture, and the crystal whose poles it has."""
+    if (ready := _map_of_large_file(options)) is not None:
+        return [ready], [Path(options.file).name], None, None
     content = read(options)
     title = crystal = None
     if options.field_ion is not None:
@@ -56,6 +58,17 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
     elif options.axis or options.rotation is not None or options.scale is not None:
         raise ValueError("--axis, --rotation and --scale are for --poles")
     return maps, titles, title, crystal
+
+
+def _map_of_large_file(options):
+    """Map of all ions of a large file, read block by block; None where more is asked for, or the ions make no map."""
+    others = (options.field_ion, options.perturbation, options.real_units, options.lens, options.poles, options.axis)
+    if any(others) or options.poles is not None or options.rotation is not None or options.scale is not None:
+        return None
+    blocks = blocks_of(options, ("x", "y"))
+    if blocks is None or not blocks.field.ions or max(blocks.field.size) == 0:
+        return None
+    return binned_blocks(blocks, options.bins, options.smooth)
 
 
 def _crystal(content, options, title):

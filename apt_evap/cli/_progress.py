@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 from apt_evap._common.progress import progress_bar
@@ -50,6 +51,24 @@ class ProgressLines:
             remaining, speed = _duration((n_ions - ions) / rate), f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
             line = f"{ions:,} of {n_ions:,} ions ({ions / n_ions:.0%}), {speed} ions/s, {remaining} left"
             print(line, file=sys.stderr, flush=True)
+
+
+def reading_progress(passes: int, quiet: bool) -> Callable[[int, int], None]:
+    """Progress of reading a file a number of times: takes the ions of each block, and those of the file."""
+    shown = None if quiet else ProgressBar() if sys.stderr.isatty() else ProgressLines()
+    done = 0
+
+    def told(ions, of):
+        nonlocal done
+        done += ions
+        # looking for strays and quantised coordinates may need further passes
+        at = min(done // passes, of)
+        if shown is not None:
+            shown(at, of)
+            if at == of and isinstance(shown, ProgressBar):
+                shown.bar.close()
+
+    return told
 
 
 def _duration(seconds):

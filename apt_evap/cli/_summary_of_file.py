@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.files import FileError
-from apt_evap.analysis.description import UNITS, describe, describe_atoms
-from apt_evap.cli._files import file_of, read
+from apt_evap.analysis.description import UNITS, describe, describe_atoms, describe_blocks
+from apt_evap.cli._files import blocks_of, file_of, read
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io._texts import without_compression
 from apt_evap.io.formats import RANGE_FORMATS, read_ranges
@@ -48,6 +48,8 @@ def _ranges(options):
 
 def _content(options):
     """Summary of a run, of ions or of a map."""
+    if (blocks := blocks_of(options)) is not None:
+        return describe_blocks(blocks)
     content, summary, file = read(options), {}, file_of(options)
     if file.selects and not isinstance(content, DetectorMap):
         ions = content.hits(content.first_perturbation) if isinstance(content, Run) else content

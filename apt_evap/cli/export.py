@@ -43,6 +43,9 @@ def execute(options: argparse.Namespace) -> int:
     output = check_path(options.output or f"{Path(options.file).stem}.epos")
     if output.exists() and not options.force:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
+    if (written := _written_in_blocks(output, options)) is not None:
+        _tell(options, output, *written, measured=True)
+        return 0
     content = read(options)
     if output.exists() and output.samefile(check_path(options.file)):
         raise FileError(f"{str(output)!r} is the file that is read: -o needs another name")
@@ -52,14 +55,35 @@ def execute(options: argparse.Namespace) -> int:
         raise ValueError(f"none of the {len(hits):,} ions of {options.file!r} hit the detector: nothing to write")
     write(output, detected, **_writing(output, content, options))
     lost, zeros = left_out(output, detected)
-    without = (
-        f", without {', '.join(lost)}" if lost and detected.outcome is not None else ""
-    )  # measured: see the warning
-    without += f", with zeros for {', '.join(zeros)}" if zeros else ""
-    tell(options, f"wrote {len(detected):,} ions to {output}{without}")
-    counts = {"ions": len(detected), "left_out": list(lost), "zeros": list(zeros)}
-    tell_json(options, {"wrote": str(output), "file": options.file} | counts)
+    _tell(options, output, len(detected), lost, zeros, measured=detected.outcome is None)
     return 0
+
+
+def _tell(options, output, ions, lost, zeros, *, measured):
+    """Say what was written."""
+    without = f", without {', '.join(lost)}" if lost and not measured else ""  # measured: see the warning
+    without += f", with zeros for {', '.join(zeros)}" if zeros else ""
+    tell(options, f"wrote {ions:,} ions to {output}{without}")
+    counts = {"ions": ions, "left_out": list(lost), "zeros": list(zeros)}
+    tell_json(options, {"wrote": str(output), "file": options.file} | counts)
+
+
+def _written_in_blocks(output, options):
+    """Number of ions and columns left out and of zeros, of a large file that is written block by block; else None."""
+    from apt_evap.cli._files import blocks_of
+    from apt_evap.io.formats import write_blocks, writes_blocks
+
+    of_run = ("real_units", "lens", "perturbation", "temperature", "jitter", "decimals", "separator", "elements")
+    if not writes_blocks(output) or any(getattr(options, name) is not None for name in of_run):
+        return None
+    if not Path(options.file).is_file() or (output.exists() and output.samefile(options.file)):
+        return None
+    blocks = blocks_of(options)
+    if blocks is None or (blocks.field is not None and not blocks.field.ions):
+        return None
+    if output.suffix.lower() == ".pos" and "positions" not in blocks.columns:
+        return None
+    return write_blocks(output, blocks)
 
 
 def _ions(content, options):

@@ -14,7 +14,7 @@ from apt_evap._common.notebook import as_picture
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_kind, check_number, check_seed, check_switch
-from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations
+from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisations, shown_bins
 from apt_evap.warnings import MapWarning, warn
 
 if TYPE_CHECKING:
@@ -45,6 +45,26 @@ class MapInput(Protocol):
     @property
     def source(self) -> str:
         """Origin of the ions."""
+        ...
+
+
+class BlockInput(Protocol):
+    """Interface of ions that are read block by block; `IonBlocks` has it."""
+
+    source: str
+
+    @property
+    def field(self) -> Any:
+        """Extent of the detected ions."""
+        ...
+
+    @property
+    def sample(self) -> Any:
+        """Coordinates x and y of every nth of the detected ions."""
+        ...
+
+    def fed(self, make: Any, *columns: str) -> Any:
+        """A consumer that has taken all blocks."""
         ...
 
 
@@ -168,24 +188,45 @@ class DetectorMap:
             extent = hits.extent if extent is None else extent
             x_edges, y_edges = bin_edges(x, y, bins, extent, quantisations if dither_seed is None else None)
 
-        # counts, and the bins inside the detector or the field of view
         counts = count(x, y, x_edges, y_edges)
+        return cls._counted(counts, x_edges, y_edges, mask, hits.extent, quantisations, hits.source, len(x))
+
+    @classmethod
+    def _counted(cls, counts, x_edges, y_edges, mask, extent, quantisations, source, detected):
+        """The map of counts, with the bins inside the detector or the field of view."""
         if not counts.any():
             raise ValueError(
-                f"none of {len(x):,} hits is in x {x_edges[0]:g} to {x_edges[-1]:g}, "
+                f"none of {detected:,} hits is in x {x_edges[0]:g} to {x_edges[-1]:g}, "
                 f"y {y_edges[0]:g} to {y_edges[-1]:g} mm"
             )
         if mask is not None:
             mask = _check_mask(mask, counts.shape)
         else:
-            mask = field_of_view(counts) if hits.extent is None else _on_detector(x_edges, y_edges, hits.extent)
+            mask = field_of_view(counts) if extent is None else _on_detector(x_edges, y_edges, extent)
         spacings = (
             None if quantisations is None else tuple(float(quantisation.spacing) for quantisation in quantisations)
         )
         ions = int(counts[mask].sum())
-        return cls(
-            counts, x_edges, y_edges, mask, True, ions, position_step=spacings, source=hits.source, detected=len(x)
-        )
+        return cls(counts, x_edges, y_edges, mask, True, ions, position_step=spacings, source=source, detected=detected)
+
+    @classmethod
+    def from_blocks(cls, ions: BlockInput, bins: int | None = None) -> DetectorMap:
+        """Count measured ions that are read block by block, as `from_hits`; the ions must not all lie at one place.
+
+        Parameters
+        ----------
+        ions : IonBlocks
+            A large file.
+        bins : int, optional
+            Number of bins along the longer side; by default those of a picture.
+
+        Returns
+        -------
+        DetectorMap
+        """
+        counter = ions.fed(lambda: _BlockCounter(ions, bins), "x", "y")
+        edges = counter.x_edges, counter.y_edges
+        return cls._counted(counter.counts, *edges, None, None, counter.quantisations, ions.source, counter.detected)
 
     @classmethod
     def from_array(
@@ -384,6 +425,28 @@ class DetectorMap:
         smoothing = f", smoothed by {self.smoothing:g} mm" if self.smoothing else ""
         source = f" from {self.source!r}" if self.source else ""
         return f"<DetectorMap: {what}{source}, {nx} x {ny} bins of {width:.4g} x {height:.4g} mm{smoothing}>"
+
+
+class _BlockCounter:
+    """Counts of ions that are read block by block, in bins that suit all of them."""
+
+    def __init__(self, ions: BlockInput, bins: int | None) -> None:
+        self.quantisations = find_quantisations(*ions.sample)
+        low, high = ions.field.low, ions.field.high
+        x, y = (np.array(pair) for pair in zip(low, high, strict=True))
+        bins = shown_bins(ions.field.ions) if bins is None else bins
+        self.x_edges, self.y_edges = bin_edges(x, y, bins, None, self.quantisations)
+        self.counts = np.zeros((len(self.y_edges) - 1, len(self.x_edges) - 1), np.int64)
+        self.detected = 0
+
+    def add(self, hits: Any) -> None:
+        """Count the next block."""
+        x, y = hits.x, hits.y
+        detected = hits.detected
+        if not detected.all():
+            x, y = x[detected], y[detected]
+        self.detected += len(x)
+        self.counts += count(x, y, self.x_edges, self.y_edges)
 
 
 def check_sigma(sigma: object, name: str, map: DetectorMap) -> float:

@@ -5,6 +5,7 @@ them would determine the extent of a map.
 """
 
 import weakref
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
@@ -73,13 +74,8 @@ def _inside(x, y):
     x_edges, y_edges = _edges(low_x, high_x, longer), _edges(low_y, high_y, longer)
     counts = count(x, y, x_edges, y_edges)
     gap = _BINS * max(_GAP, _GAP_OF_FEW / np.sqrt(len(x)))
-    side = int(gap) | 1
-    near = scipy.ndimage.uniform_filter(counts.astype(float), side, mode="constant") * side**2
-    occupied = (counts > 0) & (near >= _DENSITY * _median_of_hits(near, counts) * (1 - 1e-9))
-    joined = scipy.ndimage.distance_transform_edt(~occupied) <= gap / 2
-    labels, number = scipy.ndimage.label(joined, np.ones((3, 3)))
-    labels[~occupied] = 0
-    if number == 1 and (labels[counts > 0] == 1).all():
+    labels, number = _parts(counts, gap)
+    if _is_one(labels, number, counts):
         return None
     columns, rows = _bin(x, x_edges), _bin(y, y_edges)
     part = labels[rows, columns]
@@ -96,6 +92,61 @@ def _inside(x, y):
     kept = scipy.ndimage.distance_transform_edt(~np.isin(labels, large[large > 0])) <= gap
     inside = kept[rows, columns]
     return None if inside.all() else inside
+
+
+def _parts(counts, gap):
+    """Parts of a map that gaps [bins] separate: label of each bin, 0 where it is empty, and number of parts."""
+    side = int(gap) | 1
+    near = scipy.ndimage.uniform_filter(counts.astype(float), side, mode="constant") * side**2
+    occupied = (counts > 0) & (near >= _DENSITY * _median_of_hits(near, counts) * (1 - 1e-9))
+    joined = scipy.ndimage.distance_transform_edt(~occupied) <= gap / 2
+    labels, number = scipy.ndimage.label(joined, np.ones((3, 3)))
+    labels[~occupied] = 0
+    return labels, number
+
+
+def _is_one(labels, number, counts):
+    """Whether all ions are in one part."""
+    return number == 1 and (labels[counts > 0] == 1).all()
+
+
+class StrayCheck:
+    """Whether there may be strays among ions that are read block by block: the first step of `find_strays`.
+
+    Parameters
+    ----------
+    ions : int
+        Number of ions with finite coordinates.
+    low, high : sequence of float
+        Their smallest and largest x and y [mm].
+    """
+
+    def __init__(self, ions: int, low: Sequence[float], high: Sequence[float]) -> None:
+        (low_x, low_y), (high_x, high_y) = map(float, low), map(float, high)
+        longer = max(high_x - low_x, high_y - low_y)
+        self._counts: Integers | None = None
+        self._edges: tuple[Floats, Floats] | None = None
+        self._ions = ions
+        if ions >= _FEWEST and longer != 0:
+            self._edges = _edges(low_x, high_x, longer), _edges(low_y, high_y, longer)
+
+    def add(self, x: Floats, y: Floats) -> None:
+        """Take the next ions, whose coordinates may be NaN."""
+        if self._edges is None:
+            return
+        if not (np.isfinite(x.sum()) and np.isfinite(y.sum())):
+            finite = np.isfinite(x) & np.isfinite(y)
+            x, y = x[finite], y[finite]
+        counts = count(x, y, *self._edges)
+        self._counts = counts if self._counts is None else self._counts + counts
+
+    def none(self) -> bool:
+        """Whether there are no strays for certain."""
+        if self._edges is None:
+            return True
+        assert self._counts is not None
+        labels, number = _parts(self._counts, _BINS * max(_GAP, _GAP_OF_FEW / np.sqrt(self._ions)))
+        return bool(_is_one(labels, number, self._counts))
 
 
 def _edges(low, high, longer):

@@ -275,26 +275,33 @@ def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
         If there is no ion to write.
     """
     hit = np.ones(len(hits), bool) if hits.outcome is None else hits.outcome == Outcome.HIT
-    finite = np.ones(len(hits), bool)
+    finite = finite_rows(columns, len(hits))
+    omitted = int(np.count_nonzero(~hit)), int(np.count_nonzero(hit & ~finite))
+    tell_omitted(path, len(hits), *omitted)
+    return hit & finite if any(omitted) else slice(None)
+
+
+def finite_rows(columns: Any, n: int) -> Any:
+    """Whether all numbers of each ion are finite as they are written, bool (n,)."""
+    finite = np.ones(n, bool)
     for _, values, dtype in columns:
         if values is not None and dtype == "f4":
             with np.errstate(over="ignore"):
                 good = np.isfinite(values.astype(np.float32, copy=False))
             finite &= good if good.ndim == 1 else good.all(axis=1)
-    n_missed, n_not_finite = np.count_nonzero(~hit), np.count_nonzero(hit & ~finite)
+    return finite
+
+
+def tell_omitted(path: AnyPath, n: int, n_missed: int, n_not_finite: int) -> None:
+    """Warn of ions that are not written; ValueError if these are all."""
     counts = (n_missed, "did not hit the detector"), (n_not_finite, "have values that are not finite")
     reasons = " and ".join(f"{count:,} {what}" for count, what in counts if count)
     n_omitted = n_missed + n_not_finite
-    if n_omitted == len(hits):
-        what = f"of {len(hits):,} ions {reasons}" if reasons else "the hits are empty"
+    if n_omitted == n:
+        what = f"of {n:,} ions {reasons}" if reasons else "the hits are empty"
         raise ValueError(f"no ion to write to {str(path)!r}: {what}")
-    if n_omitted == 0:
-        return slice(None)
-    warn(
-        f"{n_omitted:,} of {len(hits):,} ions left out of {str(path)!r}: {reasons}",
-        DataWarning,
-    )
-    return hit & finite
+    if n_omitted:
+        warn(f"{n_omitted:,} of {n:,} ions left out of {str(path)!r}: {reasons}", DataWarning)
 
 
 def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None:
@@ -316,15 +323,64 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
     FileError
         If the file cannot be written.
     """
+    with replace_file(path) as file:
+        put_words(file, columns, row_size, chosen)
+
+
+def put_words(file: BinaryIO, columns: Any, row_size: int, chosen: Any) -> int:
+    """Write rows to an open file, as `write_words`; return their number."""
     columns_written = [(word, values[chosen], dtype) for word, values, dtype in columns if values is not None]
     n = len(columns_written[0][1])
-    with replace_file(path) as file:
-        for start in range(0, n, _CHUNK):
-            rows = np.zeros((min(_CHUNK, n - start), row_size // 4), ">u4")
-            for word, values, dtype in columns_written:
-                part = values[start : start + len(rows)].reshape(len(rows), -1)
-                rows.view(">" + dtype)[:, word : word + part.shape[1]] = part
-            file.write(rows.data)
+    for start in range(0, n, _CHUNK):
+        rows = np.zeros((min(_CHUNK, n - start), row_size // 4), ">u4")
+        for word, values, dtype in columns_written:
+            part = values[start : start + len(rows)].reshape(len(rows), -1)
+            rows.view(">" + dtype)[:, word : word + part.shape[1]] = part
+        file.write(rows.data)
+    return n
+
+
+class BlockWriter:
+    """Rows of 4-byte words of the detected ions of a file that is read block by block.
+
+    Parameters
+    ----------
+    file : file
+        Open for writing; emptied first.
+    row_size : int
+        Bytes per ion.
+    columns_of : callable
+        Columns as for `write_words` of `Hits`, and a function that returns further ones for a selection of the ions.
+
+    Attributes
+    ----------
+    detected, written : int
+        Numbers of ions.
+    highest : dict
+        Largest voltage, and pulse voltage, of the written ions; 0 where there is none.
+    """
+
+    def __init__(self, file: BinaryIO, row_size: int, columns_of: Callable[[Hits], Any]) -> None:
+        file.seek(0)
+        file.truncate()
+        self._file, self._row_size, self._columns_of = file, row_size, columns_of
+        self.detected = self.written = 0
+        self.highest = {"voltage": 0.0, "pulse_voltage": 0.0}
+
+    def add(self, hits: Hits) -> None:
+        """Write the detected ions of the next block."""
+        detected = hits.detected
+        if not detected.all():
+            hits = hits[detected]
+        self.detected += len(hits)
+        columns, further = self._columns_of(hits)
+        finite = finite_rows(columns, len(hits))
+        chosen = slice(None) if finite.all() else finite
+        if len(hits):
+            self.written += put_words(self._file, [*columns, *further(chosen)], self._row_size, chosen)
+        for name in self.highest:
+            if (values := getattr(hits, name)) is not None and len(values[chosen]):
+                self.highest[name] = max(self.highest[name], float(np.abs(values[chosen]).max()))
 
 
 def _wrong_size(path, size, row_size, kind, rival):

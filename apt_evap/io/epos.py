@@ -4,11 +4,12 @@ Larson et al., Local Electrode Atom Probe Tomography (Springer, 2013), appendix 
 detector coordinates in mm, in contrast to the units printed there.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
 from apt_evap.detection.hits import Hits
@@ -20,7 +21,18 @@ from apt_evap.io._pulses import (
     pulses_from_first,
     whole_pulses,
 )
-from apt_evap.io._records import MM, check_any, choose, choose_fields, in_mm, open_words, write_words
+from apt_evap.io._records import (
+    MM,
+    BlockWriter,
+    check_any,
+    choose,
+    choose_fields,
+    in_mm,
+    open_words,
+    tell_omitted,
+    write_words,
+)
+from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.warnings import DataWarning, warn
 
 _ROW = 44
@@ -37,9 +49,10 @@ _FIELDS = {
     "ions": (10, 1, "u4"),
 }
 WRITTEN = tuple(_FIELDS)[:-1]
+_GROUPING = ("pulse_id", "multiplicity")
 _UNITS = ("V", "kV")
 _LEAST = 100.0  # [V]: instruments have higher voltages, and files in kV lower numbers
-_COLUMNS = (*tuple(_FIELDS)[:-1], "pulse_id", "multiplicity")
+_COLUMNS = (*tuple(_FIELDS)[:-1], *_GROUPING)
 # further fields needed to find out whether a column is absent, and its unit
 _WITH = {"x": ("y",), "y": ("x",), "pulse_voltage": ("voltage",), "pulse_id": ("ions",), "multiplicity": ("ions",)}
 
@@ -122,40 +135,98 @@ def chunk_epos(
     ValueError
         If `rows` is less than the number of ions of one pulse.
     """
-    chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
-    fields = {**fields, "ions": _FIELDS["ions"]}
-    survey = _Survey(voltage_unit, detector_unit)
-    with _open(path, partial, byte_order) as words:
-        for block in words.survey(fields):
-            survey.add(block)
-            del block
-        survey.end(words.cut, path)
+    chosen, _ = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
+    blocks = EposBlocks(
+        path, chosen, partial=partial, byte_order=byte_order, voltage_unit=voltage_unit, detector_unit=detector_unit,
+        pulses=True,
+    )  # fmt: skip
+    # the last pulse of a truncated file may have fewer rows than ions
+    if blocks.largest > rows and not blocks.cut:
+        raise blocks.too_few(blocks.largest, rows)
+    yield from blocks.blocks(chosen, rows, pulses=True)
 
-        def too_few(largest):
-            return ValueError(
-                f"rows must be >= {largest}, the number of ions in the largest pulse of {str(path)!r}, got {rows}"
-            )
+
+class EposBlocks:
+    """An .epos file that is read in blocks as often as needed, after one pass over the columns that are needed.
+
+    Parameters
+    ----------
+    path, columns, partial, byte_order, voltage_unit, detector_unit
+        As for `read_epos`; only these columns can be read.
+    pulses : bool
+        Whether to look at the pulses even if no column needs them.
+    watch : callable, optional
+        Receives the number of ions, and then x and y [mm] of each block of the first pass.
+    progress : callable, optional
+        Receives the number of ions of each block of the first pass, and of the file.
+    """
+
+    def __init__(
+        self,
+        path: AnyPath,
+        columns: Sequence[str] | None = None,
+        *,
+        partial: bool = False,
+        byte_order: str | None = None,
+        voltage_unit: str | None = None,
+        detector_unit: str = "mm",
+        pulses: bool = False,
+        watch: Callable[[int], Callable[[Any, Any], object]] | None = None,
+        progress: Callable[[int, int], object] = lambda ions, of: None,
+    ) -> None:
+        self._path, self._opening = path, (path, partial, byte_order)
+        chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
+        if pulses:
+            fields = {**fields, "ions": _FIELDS["ions"]}
+        self._survey = survey = _Survey(voltage_unit, detector_unit)
+        with _open(*self._opening) as words:
+            self.n, self.cut = words.n, words.cut
+            seen = None if watch is None or not {"x", "y"} <= set(fields) else watch(words.n)
+            for block in words.survey(fields):
+                survey.add(block)
+                if seen is not None:
+                    places = in_mm({name: block[name] for name in ("x", "y")}, detector_unit)
+                    seen(places["x"], places["y"])
+                progress(len(next(iter(block.values()))), self.n)
+                del block
+            survey.end(words.cut, path)
+        self.largest = survey.largest if survey.grouped else 0
+        known = survey.present | ({*_GROUPING} if survey.grouped else set())
+        self.columns = tuple(name for name in chosen if name in known)
+
+    def too_few(self, largest: int, rows: int) -> ValueError:
+        """Error for blocks that are smaller than a pulse."""
+        return ValueError(
+            f"rows must be >= {largest}, the number of ions in the largest pulse of {str(self._path)!r}, got {rows}"
+        )
+
+    def blocks(self, columns: Sequence[str], rows: int, pulses: bool = False) -> Iterator[Hits]:
+        """Blocks of at most `rows` ions; of complete pulses if a column needs them, or with `pulses`."""
+        survey = self._survey
+        chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, self._path, _WITH)
+        grouped = survey.grouped and (pulses or bool({*_GROUPING} & set(chosen)))
+        if pulses:
+            fields = {**fields, "ions": _FIELDS["ions"]}
 
         def keep(block):
-            if not survey.grouped:
+            if not grouped:
                 return rows
             ions = survey.first_ions(block["ions"])
             n = whole_pulses(ions)
             if n == 0:
-                raise too_few(ions[0])
+                raise self.too_few(ions[0], rows)
             return n
 
-        # the last pulse of a truncated file may have fewer rows than ions
-        if survey.grouped and rows < survey.largest and not words.cut:
-            raise too_few(survey.largest)
         first_pulse = 0
-        for block in words.blocks(fields, rows, keep):
-            if survey.grouped:
-                block["ions"] = survey.first_ions(block["ions"])
-            pulses = np.count_nonzero(block["ions"])
-            yield _hits(block, survey, chosen, path, first_pulse)
-            first_pulse += pulses
-            del block
+        with _open(*self._opening) as words:
+            for block in words.blocks(fields, rows, keep):
+                number = 0
+                if grouped:
+                    block["ions"] = survey.first_ions(block["ions"])
+                    number = np.count_nonzero(block["ions"])
+                yield _hits(block, survey, chosen, self._path, first_pulse)
+                first_pulse += number
+                del block
 
 
 class _Survey:
@@ -228,7 +299,7 @@ def _hits(block, survey, chosen, path, first_pulse=0):
         with np.errstate(over="ignore"):
             for name in {"voltage", "pulse_voltage"} & set(columns):
                 columns[name] = columns[name] * np.float32(1000)
-    if survey.grouped and {"pulse_id", "multiplicity"} & set(chosen):
+    if survey.grouped and {*_GROUPING} & set(chosen):
         columns["pulse_id"], columns["multiplicity"] = pulses_from_first(block["ions"], first_pulse)
     requested = {name: columns.get(name) for name in chosen}
     check_any(requested, path)
@@ -262,6 +333,33 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     FileError
         If the file cannot be written.
     """
+    columns, further = _written(hits)
+    chosen = choose(path, hits, columns)
+    highest = next(
+        (np.abs(v[chosen]).max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()),
+        np.nan,
+    )
+    _warn_of_volts(path, highest)
+    write_words(path, [*columns, *further(chosen)], _ROW, chosen)
+
+
+def write_epos_blocks(path: AnyPath, ions: IonBlocks) -> int:
+    """Write the detected ions of a large file as `write_epos` does, block by block; return the number of detected ions.
+
+    Raises
+    ------
+    ValueError, FileError
+        As for `write_epos`.
+    """
+    with replace_file(path) as file:
+        writer = ions.fed(lambda: BlockWriter(file, _ROW, _written))
+        tell_omitted(path, writer.detected, 0, writer.detected - writer.written)
+        _warn_of_volts(path, next((volts for volts in writer.highest.values() if volts), np.nan))
+    return writer.detected
+
+
+def _written(hits):
+    """Columns to write, and a function that returns that of the ions per pulse, for a selection of the ions."""
     columns = [
         (0, hits.positions, "f4"),
         (3, hits.mass_to_charge, "f4"),
@@ -272,20 +370,23 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
         (8, hits.y, "f4"),
         (9, hits.pulses, "u4"),
     ]
-    chosen = choose(path, hits, columns)
-    highest = next(
-        (np.abs(v[chosen]).max() for v in (hits.voltage, hits.pulse_voltage) if v is not None and v[chosen].any()),
-        np.nan,
-    )
+
+    def further(chosen):
+        ions = np.zeros(len(hits), np.uint32)
+        if hits.pulse_id is not None:
+            ions[chosen] = first_from_equal(hits.pulse_id[chosen])
+        elif hits.outcome is not None or hits.ion is not None:
+            ions[:] = 1
+        return [(10, ions, "u4")]
+
+    return columns, further
+
+
+def _warn_of_volts(path, highest):
+    """Warn if the largest voltage is that of a file in kV."""
     if highest < _LEAST:
         warn(
             f"{str(path)!r}: voltages of at most {highest:.4g} V can be taken for kV: the format does not contain "
             f"their unit; {_IN_VOLTS}",
             DataWarning,
         )
-    ions = np.zeros(len(hits), np.uint32)
-    if hits.pulse_id is not None:
-        ions[chosen] = first_from_equal(hits.pulse_id[chosen])
-    elif hits.outcome is not None or hits.ion is not None:
-        ions[:] = 1
-    write_words(path, [*columns, (10, ions, "u4")], _ROW, chosen)

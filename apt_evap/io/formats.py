@@ -4,6 +4,7 @@ A new format needs one module with a reader, a writer or both, and one line in `
 """
 
 import inspect
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,10 +25,11 @@ from apt_evap.io.ato import read_ato
 from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
-from apt_evap.io.epos import chunk_epos, read_epos, write_epos
+from apt_evap.io.epos import EposBlocks, chunk_epos, read_epos, write_epos, write_epos_blocks
+from apt_evap.io.ion_blocks import ROWS, BlockReader, Field, IonBlocks
 from apt_evap.io.npz import read_map
 from apt_evap.io.pos import WRITTEN as POS
-from apt_evap.io.pos import chunk_pos, read_pos, write_pos
+from apt_evap.io.pos import PosBlocks, chunk_pos, read_pos, write_pos, write_pos_blocks
 from apt_evap.io.raw import chunk_raw, read_raw
 from apt_evap.io.rng import read_rng
 from apt_evap.io.rrng import read_rrng
@@ -56,7 +58,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: suffix (also its name), first bytes, reader, writer, reader in chunks, and what is written.
+    """A file format: suffix (also its name), first bytes, reader, writer, readers in parts, and what is written.
 
     `fixed` are the columns that the writer always writes, as zeros if they are missing; empty if it writes those of the
     ions. `keeps` decides whether it writes a column, by its name and values.
@@ -67,6 +69,7 @@ class Format:
     read: Callable | None = None
     write: Callable | None = None
     chunks: Callable | None = None
+    blocks: Callable[..., BlockReader] | None = None
     fixed: tuple[str, ...] = ()
     keeps: Callable[[str, NDArray[Any]], bool] = lambda name, values: True
 
@@ -98,12 +101,16 @@ _OF_PYCCAPT += ("uncalibrated_mass_to_charge", "multi")
 _WIDEST, _NARROWEST = 500.0, 1.0  # [mm]: of a detector; those of atom probes have 80 to 120
 _ATOM = 0.1  # nm, smaller than any atom
 _ENOUGH = 100  # ions: fewer may be near each other
+LARGE = 1 << 26
+"""Bytes of a file from which its ions are read in blocks: 1.5 million of an .epos. Smaller ones need 0.2 GB at most."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 FORMATS = (
-    Format(".h5", _HDF5, _read_hdf5, _write_pyccapt, None, EPOS, lambda name, _: name in _OF_PYCCAPT),
+    Format(".h5", _HDF5, _read_hdf5, _write_pyccapt, None, None, EPOS, lambda name, _: name in _OF_PYCCAPT),
     Format(".nxs", _HDF5, _read_hdf5, _write_nxapm, keeps=lambda name, values: values.dtype.kind in "biuf"),
-    Format(".epos", None, read_epos, write_epos, chunk_epos, EPOS, lambda name, _: name in (*EPOS, *_GROUPING)),
-    Format(".pos", None, read_pos, write_pos, chunk_pos, POS, lambda name, _: name in POS),
+    Format(
+        ".epos", None, read_epos, write_epos, chunk_epos, EposBlocks, EPOS, lambda name, _: name in (*EPOS, *_GROUPING)
+    ),
+    Format(".pos", None, read_pos, write_pos, chunk_pos, PosBlocks, POS, lambda name, _: name in POS),
     Format(".apt", SIGNATURE, read_apt, None, chunk_apt),
     Format(".raw", None, read_raw, None, chunk_raw),
     Format(".ato", None, read_ato),
@@ -115,6 +122,7 @@ FORMATS = (
     Format(".tapsim", TAPSIM, read_tapsim, write_tapsim, keeps=lambda name, _: name in TAPSIM_COLUMNS),
 )
 
+_BLOCK_WRITERS = {".epos": write_epos_blocks, ".pos": write_pos_blocks}
 RANGE_FORMATS = {".rrng": read_rrng, ".rng": read_rng, ".env": read_env, ".xrng": read_xrng}
 """Readers of files of mass ranges, by suffix."""
 
@@ -209,6 +217,56 @@ def chunks(
     return _with_warning_of_size(path, parts)
 
 
+def ion_blocks(
+    path: AnyPath,
+    columns: Sequence[str] | None = None,
+    *,
+    format: str | None = None,
+    progress: Callable[[int, int], object] = lambda ions, of: None,
+    **options: Any,
+) -> IonBlocks | None:
+    """Blocks of the ions of a large file, for answers in memory that does not depend on their number.
+
+    Parameters
+    ----------
+    path, columns, format, **options
+        As for `read`.
+    progress : callable, optional
+        Receives the number of ions of each block that is read, and of the file. Ions are read more than once.
+
+    Returns
+    -------
+    IonBlocks or None
+        None for a file that is to be read whole: smaller than `LARGE`, of another format than .epos and .pos, without
+        one of these columns, or with a pulse that is larger than a block.
+
+    Raises
+    ------
+    FileError
+        As for `read`.
+    """
+    chosen = format_of(path, format)
+    if chosen.blocks is None or os.stat(check_path(path)).st_size < LARGE:
+        return None
+    assert chosen.chunks is not None
+    options = _options(path, chosen, chosen.chunks, columns, options)
+    fields = []
+
+    def watch(ions):
+        fields.append(Field(ions))
+        return fields[0].add
+
+    reader = chosen.blocks(path, watch=watch, progress=progress, **options)
+    if not set(columns or ()) <= set(reader.columns) or reader.largest > ROWS:
+        return None
+    field = fields[0] if {"x", "y"} <= set(reader.columns) else None
+    ions = IonBlocks(
+        reader, field, str(path), lambda size, of_detected: _warn_of_extent(path, size, of_detected, reader.n)
+    )
+    ions.progress = progress
+    return ions
+
+
 def _with_warning_of_size(path, parts):
     warned = False
     for part in parts:
@@ -232,14 +290,19 @@ def _warn_of_size(path, content):
             return True
     if isinstance(content, Hits) and content.outcome is None and content.x is not None and content.y is not None:
         size = _size(content, np.isfinite(content.x) & np.isfinite(content.y))
-        if max(size) > _WIDEST:  # perhaps by strays alone, which have a warning of their own
-            size = _size(content, content.detected)
-    elif isinstance(content, DetectorMap):
-        x_min, x_max, y_min, y_max = content.extent
-        size = (x_max - x_min, y_max - y_min)
-    else:
+        return _warn_of_extent(path, size, lambda: _size(content, content.detected), len(content))
+    if not isinstance(content, DetectorMap):
         return False
-    if 0 < max(size) < _NARROWEST and (not isinstance(content, Hits) or len(content) >= _ENOUGH):
+    x_min, x_max, y_min, y_max = content.extent
+    size = (x_max - x_min, y_max - y_min)
+    return _warn_of_extent(path, size, lambda: size, _ENOUGH)
+
+
+def _warn_of_extent(path, size, of_detected, number):
+    """Warn if the extent of a map, or of a number of ions, is that of no detector."""
+    if max(size) > _WIDEST:  # perhaps by strays alone, which have a warning of their own
+        size = of_detected()
+    if 0 < max(size) < _NARROWEST and number >= _ENOUGH:
         warn(
             f"{str(path)!r} has detector coordinates in {size[0]:.4g} x {size[1]:.4g} mm, no detector is narrower than "
             f"{_NARROWEST:g} mm: are they in mm?",
@@ -314,7 +377,46 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
     _check_options(path, chosen, "writing", _known(chosen.write, "hits"), options)
     chosen.write(path, hits, **options)
     lost, _ = left_out(path, hits, format=format)
-    if lost and hits.outcome is None and hits.ion is None:
+    if hits.outcome is None and hits.ion is None:
+        _warn_of_lost(path, chosen, lost)
+
+
+def write_blocks(path: AnyPath, ions: IonBlocks) -> tuple[int, tuple[str, ...], tuple[str, ...]]:
+    """Write the detected ions of a large file block by block, with the same bytes as `write`.
+
+    Parameters
+    ----------
+    path : str or path-like
+        The file, .pos or .epos.
+    ions : IonBlocks
+        All ions.
+
+    Returns
+    -------
+    detected : int
+        Number of detected ions.
+    left_out, zeros : tuple of str
+        As of `left_out`.
+
+    Raises
+    ------
+    FileError, ValueError
+        As for `write`.
+    """
+    chosen = _by_suffix(path, None, "write")
+    detected = _BLOCK_WRITERS[chosen.suffix](path, ions)
+    lost = tuple(name for name in ions.columns if not chosen.keeps(name, np.empty(0)))
+    _warn_of_lost(path, chosen, lost)
+    return detected, lost, tuple(name for name in chosen.fixed if name not in ions.columns)
+
+
+def writes_blocks(path: AnyPath) -> bool:
+    """Whether a file of this name can be written block by block."""
+    return check_path(path).suffix.lower() in _BLOCK_WRITERS
+
+
+def _warn_of_lost(path, chosen, lost):
+    if lost:
         warn(
             f"{str(path)!r} is without the columns {', '.join(lost)}, for which a {chosen.suffix} file has no place",
             DataWarning,

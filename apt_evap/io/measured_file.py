@@ -17,6 +17,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.io import formats
 from apt_evap.io.distortion_grid import read_grid
+from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
 
 _ARRAYS = ("values", "x_edges", "y_edges", "mask")
@@ -131,6 +132,28 @@ class MeasuredFile:
             raise ValueError(f"--undistort is only for measured ions, {self.path!r} contains {what}")
         self.check_columns(content)
         return self._undistorted(_PACKAGE, content)
+
+    def blocks(
+        self, columns: tuple[str, ...] | None = None, progress: Callable[[int, int], object] = lambda ions, of: None
+    ) -> IonBlocks | None:
+        """Blocks of the ions of a large file, all of which are used; None if it is to be read whole, see `ion_blocks`.
+
+        Parameters
+        ----------
+        columns : tuple of str, optional
+            Columns that are needed; by default all.
+        progress : callable, optional
+            Receives the number of ions of each block, and of the file.
+
+        Raises
+        ------
+        FileError
+            If the file cannot be read.
+        """
+        changed = (self.selects, self.peaks, self.undistort, self.exchange_axes, self.distance)
+        if any(change not in (None, False) for change in changed) or self.is_map or not os.path.isfile(self.path):
+            return None
+        return formats.ion_blocks(self.path, columns, progress=progress, **self._reading())
 
     def measured(self, note: Callable[[str], None], read: Callable[..., Any] = formats.read) -> Hits | DetectorMap:
         """The ions that are used, for a map, or the map of the file; notes say which ions are those of `peaks`.

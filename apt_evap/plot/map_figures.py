@@ -14,6 +14,7 @@ from apt_evap.detection.binning import bins_for, shown_bins
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.maps.crystallography.directions import label as plane_label
 from apt_evap.plot._figure import (
     OUTSIDE,
@@ -208,9 +209,21 @@ def binned(hits: Hits, bins: int | None = None, smoothing: float | None = None) 
     """
     ions = int(np.count_nonzero(check_kind(hits, "hits", Hits, "Hits").detected))
     counts = hits.map(shown_bins(ions) if bins is None else bins)
-    return counts.smoothed(
-        default_smoothing(counts, ions if bins is None else None) if smoothing is None else smoothing
-    )
+    return _smoothed(counts, ions, bins, smoothing)
+
+
+def binned_blocks(ions: IonBlocks, bins: int | None = None, smoothing: float | None = None) -> DetectorMap:
+    """The same map of ions that are read block by block; arguments as for `binned`."""
+    counts = DetectorMap.from_blocks(ions, bins)
+    assert counts.detected is not None
+    return _smoothed(counts, counts.detected, bins, smoothing)
+
+
+def _smoothed(counts, ions, bins, smoothing):
+    """A map of a number of ions, smoothed as for `binned`."""
+    if smoothing is None:
+        smoothing = default_smoothing(counts, ions if bins is None else None)
+    return counts.smoothed(smoothing)
 
 
 def default_smoothing(map: DetectorMap, ions: int | None = None) -> float:

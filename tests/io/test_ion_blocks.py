@@ -1,0 +1,212 @@
+"""Answers of a file that is read block by block are those of the file that is read whole, bit by bit."""
+
+import json
+import tracemalloc
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from apt_evap.cli.main import main
+from apt_evap.cli.parser import make_parser
+from apt_evap.io import formats, ion_blocks
+from apt_evap.io.measured_file import MeasuredFile
+
+pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
+N = 20_000
+SIZES = (101, 977, 1 << 14, 1 << 20)
+
+
+def rows_of(n=N, seed=3):
+    """Rows of an .epos: ions on a disc with peaks of mass, pairs in a tenth of the pulses."""
+    random = np.random.default_rng(seed)
+    radius, angle = 30 * np.sqrt(random.random(n)), 2 * np.pi * random.random(n)
+    mass = random.choice([26.98, 13.49, 27.98, 1.008], n, p=[0.6, 0.2, 0.15, 0.05])
+    mass = np.where(random.random(n) < 0.1, random.uniform(0.6, 90, n), mass * random.normal(1, 4e-4, n))
+    voltage = np.linspace(3000, 5000, n)
+    rows = np.zeros((n, 11), ">u4")
+    values = rows.view(">f4")
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    columns = (0.8 * x, 0.8 * y, np.linspace(0, 50, n), mass, 90 * np.sqrt(mass / 4), voltage, voltage / 5, x, y)
+    for at, column in enumerate(columns):
+        values[:, at] = column
+    rows[:, 9], rows[:, 10] = random.geometric(0.02, n), 1
+    first = np.flatnonzero(random.random(n - 1) < 0.1)
+    first = first[np.diff(first, prepend=-2) > 1]
+    rows[first, 10], rows[first + 1, 10], rows[first + 1, 9] = 2, 0, 0
+    return rows
+
+
+def with_change(change):
+    """Rows with a change of their numbers, and of those as float32."""
+    rows = rows_of()
+    change(rows, rows.view(">f4"))
+    return rows.tobytes()
+
+
+def _strays(rows, values):
+    values[5::700, 7], values[5::700, 8] = -190.0, -190.0
+    values[9, 7] = 4e29
+
+
+def _not_finite(rows, values):
+    values[3::500, 7], values[4::900, 8], values[8::1000, 3], values[11, 0] = np.nan, np.inf, np.nan, np.inf
+
+
+def _quantised(rows, values):
+    values[:, 7:9] = np.rint(values[:, 7:9] / 0.06) * 0.06
+
+
+def _negative(rows, values):
+    values[7::300, 3], values[:5, 5] = -3.0, -20.0
+
+
+def _of_every_ion(rows, values):
+    rows[1:, 10] = np.where(rows[1:, 10] == 0, 2, rows[1:, 10])
+
+
+def _none(rows, values):
+    pass
+
+
+FILES = {
+    "plain": with_change(_none),
+    "strays": with_change(_strays),
+    "not finite": with_change(_not_finite),
+    "strays and not finite": with_change(lambda rows, values: (_strays(rows, values), _not_finite(rows, values))),
+    "quantised": with_change(_quantised),
+    "negative": with_change(_negative),
+    "kilovolts": with_change(lambda rows, values: values[:, 5:7].__itruediv__(1000)),
+    "centimetres": with_change(lambda rows, values: values[:, 7:9].__itruediv__(10)),
+    "too small": with_change(lambda rows, values: values[:, 7:9].__itruediv__(1000)),
+    "too large": with_change(lambda rows, values: values[:, 7:9].__imul__(30)),
+    "columns of zeros": with_change(lambda rows, values: rows.__setitem__((slice(None), [0, 1, 2, 4, 6, 9]), 0)),
+    "pulses of every ion": with_change(_of_every_ion),
+    "pulses that are not consistent": with_change(lambda rows, values: rows.__setitem__((slice(100, 103), 10), 9)),
+    "truncated": with_change(_none)[:-60],
+    "little": with_change(_none),
+}
+OPTIONS = {
+    "truncated": ["--partial"],
+    "centimetres": ["--unit", "cm"],
+    "kilovolts": ["--voltage-unit", "kV"],
+}
+
+
+@pytest.fixture
+def blocks_of(monkeypatch):
+    """Read all files in blocks of this number of ions, or whole for None."""
+
+    def chosen(rows):
+        monkeypatch.setattr(formats, "LARGE", 1 << 60 if rows is None else 0)
+        for module in (formats, ion_blocks):
+            monkeypatch.setattr(module, "ROWS", rows or 1)
+
+    return chosen
+
+
+def answers(capsys, *words):
+    """Exit code, output and errors of a command."""
+    code = main([*words])
+    out = capsys.readouterr()
+    return code, out.out, out.err
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_blocks_give_the_answers_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.epos").write_bytes(FILES[name])
+    words = ["a.epos", *OPTIONS.get(name, ())]
+    whole = []
+    for rows in (None, *SIZES):
+        blocks_of(rows)
+        given = [answers(capsys, "info", *words, "--json"), answers(capsys, "info", *words)]
+        given.append(answers(capsys, "export", *words, "-o", "b.epos", "--force"))
+        given.append((tmp_path / "b.epos").read_bytes())
+        given.append(answers(capsys, "export", *words, "-o", "b.pos", "--force"))
+        given.append((tmp_path / "b.pos").read_bytes() if (tmp_path / "b.pos").exists() else b"")
+        if rows is None:
+            whole = given
+            assert json.loads(given[0][1])["ions"] == N - (2 if name == "truncated" else 0)
+        assert given == whole, rows
+
+
+@contextmanager
+def map_of(words):
+    """Map that a command draws."""
+    from apt_evap.cli._maps_of_file import maps_of_file
+
+    (drawn,), titles, title, crystal = maps_of_file(make_parser().parse_args(["map", *words]))
+    yield drawn, (titles, title, crystal)
+
+
+@pytest.mark.parametrize("bins", [[], ["--bins", "50"]])
+@pytest.mark.parametrize("name", FILES)
+def test_blocks_give_the_map_of_the_whole_file(tmp_path, monkeypatch, blocks_of, name, bins):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.epos").write_bytes(FILES[name])
+    words = ["a.epos", *OPTIONS.get(name, ()), *bins]
+    expected = None
+    for rows in (None, *SIZES):
+        blocks_of(rows)
+        with map_of(words) as (drawn, titles):
+            given = {
+                key: value.tobytes() if isinstance(value, np.ndarray) else value for key, value in vars(drawn).items()
+            }
+            given["titles"] = titles
+        expected = expected or given
+        assert given == expected, rows
+    assert expected["detected"] > 0
+
+
+def test_a_pos_is_read_in_blocks(tmp_path, monkeypatch, capsys, blocks_of):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.pos").write_bytes(np.ascontiguousarray(rows_of()[:, :4]).tobytes())
+    given = []
+    for rows in (None, *SIZES):
+        blocks_of(rows)
+        given.append((answers(capsys, "info", "a.pos"), answers(capsys, "export", "a.pos", "-o", "b.epos", "--force")))
+        given[-1] += ((tmp_path / "b.epos").read_bytes(),)
+    assert all(one == given[0] for one in given)
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch, blocks_of):
+    monkeypatch.chdir(tmp_path)
+    blocks_of(1 << 12)
+    peaks = {}
+    for copies in (5, 20):
+        (tmp_path / "a.epos").write_bytes(FILES["plain"] * copies)
+        for command, more in (("info", []), ("export", ["-o", "b.epos", "--force"]), ("map", ["-o", "a.png"])):
+            words = [command, "a.epos", *more]
+            if command == "map":
+
+                def work(words=words):
+                    with map_of(words[1:2]):
+                        pass
+            else:
+
+                def work(words=words):
+                    assert main([*words]) == 0
+
+            work()
+            tracemalloc.start()
+            work()
+            peaks[command, copies] = tracemalloc.get_traced_memory()[1]
+            tracemalloc.stop()
+    for command in ("info", "export", "map"):
+        # 300,000 ions more, which would be 13 MB
+        assert peaks[command, 20] - peaks[command, 5] < 1.5e6, command
+
+
+def test_only_plain_answers_are_made_of_blocks(tmp_path, blocks_of):
+    """Selections, other formats and small files are read whole."""
+    path = tmp_path / "a.epos"
+    path.write_bytes(FILES["plain"])
+    blocks_of(1000)
+    assert len(MeasuredFile(str(path)).blocks(("x", "y"))) == N
+    for options in ({"mass": (1, 20)}, {"ions": (0, 10)}, {"distance": 90.0}, {"peaks": "Al"}, {"circle": (9, (0, 0))}):
+        assert MeasuredFile(str(path), **options).blocks() is None
+    blocks_of(1)  # pulses are larger
+    assert MeasuredFile(str(path)).blocks() is None
+    blocks_of(None)
+    assert MeasuredFile(str(path)).blocks() is None
