@@ -44,11 +44,21 @@ def read(options: argparse.Namespace) -> Hits | Run | DetectorMap:
     return file_of(options).load(_read)
 
 
-def blocks_of(options: argparse.Namespace, columns: tuple[str, ...] | None = None, passes: int = 2) -> Any:
-    """Blocks of the ions of a large FILE that are read a number of times, with progress; None for other files."""
+def blocks_of(
+    options: argparse.Namespace,
+    columns: tuple[str, ...] | None = None,
+    *,
+    further: tuple[str, ...] = (),
+    ranges: bool = True,
+) -> Any:
+    """Blocks of the ions of a large FILE, which is read twice, with progress; None for other files.
+
+    `columns` are needed, `further` ones are read if the file has them; without `ranges` these select no ions.
+    """
     if options.file.endswith(".unfinished"):
         return None
-    return file_of(options).blocks(columns, reading_progress(passes, quiet=getattr(options, "quiet", False)))
+    file = file_of(options) if ranges else replace(file_of(options), ranges=None)
+    return file.blocks(columns, reading_progress(2, quiet=getattr(options, "quiet", False)), further)
 
 
 def _read(path, **options):

@@ -38,8 +38,11 @@ def abundances_of(texts: list[str] | None) -> dict[str, dict[int, float]] | None
     return enriched or None
 
 
-def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
-    """The spectrum of the ions of FILE that the options select, of all or only of the ions of ranges."""
+def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool = False) -> Any:
+    """The spectrum of the ions of FILE that the options select, of all or only of the ions of ranges.
+
+    Ions of a large file have only their masses, unless their pulses are needed.
+    """
     from dataclasses import replace
 
     from apt_evap.cli._files import file_of, read
@@ -48,7 +51,8 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
 
     if options.mass is not None or options.species is not None:
         raise ValueError("--mass and --species select peaks, of which a spectrum needs all")
-    hits = read(options)
+    large = None if pulses else _masses_of_large_file(options)
+    hits = read(options) if large is None else large
     if not isinstance(hits, Hits):
         raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
     if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
@@ -63,3 +67,34 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None) -> Any:
     if ions.mass_to_charge is not None and not (ions.detected & (ions.mass_to_charge > 0)).any():
         raise ValueError(f"a spectrum needs detected ions with a mass-to-charge ratio above 0, got none of {ions!r}")
     return spectrum(ions, elements, ranges, abundances_of(options.isotope), **flight)
+
+
+def alone_of(options: argparse.Namespace) -> Any:
+    """Whether each ion of a large file is the only one of its pulse, bool (n,); None if its pulses are not known."""
+    import numpy as np
+
+    from apt_evap.cli._files import blocks_of
+
+    blocks = blocks_of(options, ("pulse_id",), ranges=False)
+    if blocks is None:
+        return None
+    parts: list[Any] = []
+
+    class Alone:
+        def add(self, hits):
+            same = np.concatenate([[False], hits.pulse_id[1:] == hits.pulse_id[:-1], [False]])
+            parts.append(~(same[1:] | same[:-1]))
+
+    blocks.fed(Alone, "pulse_id")
+    return np.concatenate(parts)
+
+
+def _masses_of_large_file(options):
+    """Masses of all ions of a large file, 4 bytes each; None for another one, or without masses of detected ions."""
+    from apt_evap.cli._files import blocks_of
+
+    blocks = blocks_of(options, ("mass_to_charge",), further=("x", "y"), ranges=False)
+    if blocks is None:
+        return None
+    hits = blocks.column("mass_to_charge")
+    return hits if (hits.detected & (hits.mass_to_charge > 0)).any() else None

@@ -60,7 +60,7 @@ def execute(options: argparse.Namespace) -> int:
             raise FileError(f"{str(saved)!r} exists: --force overwrites it")
         check_output(saved, lambda path: True, options.force)
     ranges = None if options.ranges is None else read_ranges(options.ranges)
-    result = spectrum_of(options, ranges)
+    result = spectrum_of(options, ranges, pulses=pairs is not None)
     tell(options, f"{result}")
     if result.flight is not None and result.flight.peaks:
         fit = result.flight

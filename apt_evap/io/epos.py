@@ -161,6 +161,9 @@ class EposBlocks:
         Receives the number of ions of each block of the first pass, and of the file.
     """
 
+    available = _COLUMNS
+    """Columns of the format."""
+
     def __init__(
         self,
         path: AnyPath,

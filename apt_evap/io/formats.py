@@ -26,7 +26,7 @@ from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
 from apt_evap.io.epos import EposBlocks, chunk_epos, read_epos, write_epos, write_epos_blocks
-from apt_evap.io.ion_blocks import ROWS, BlockReader, Field, IonBlocks
+from apt_evap.io.ion_blocks import ROWS, Field, IonBlocks
 from apt_evap.io.npz import read_map
 from apt_evap.io.pos import WRITTEN as POS
 from apt_evap.io.pos import PosBlocks, chunk_pos, read_pos, write_pos, write_pos_blocks
@@ -69,7 +69,7 @@ class Format:
     read: Callable | None = None
     write: Callable | None = None
     chunks: Callable | None = None
-    blocks: Callable[..., BlockReader] | None = None
+    blocks: type[EposBlocks] | type[PosBlocks] | None = None
     fixed: tuple[str, ...] = ()
     keeps: Callable[[str, NDArray[Any]], bool] = lambda name, values: True
 
@@ -222,6 +222,7 @@ def ion_blocks(
     columns: Sequence[str] | None = None,
     *,
     format: str | None = None,
+    further: tuple[str, ...] = (),
     progress: Callable[[int, int], object] = lambda ions, of: None,
     **options: Any,
 ) -> IonBlocks | None:
@@ -231,6 +232,8 @@ def ion_blocks(
     ----------
     path, columns, format, **options
         As for `read`.
+    further : tuple of str
+        Columns that are read if the file has them.
     progress : callable, optional
         Receives the number of ions of each block that is read, and of the file. Ions are read more than once.
 
@@ -249,8 +252,12 @@ def ion_blocks(
     if chosen.blocks is None or os.stat(check_path(path)).st_size < LARGE:
         return None
     assert chosen.chunks is not None
-    options = _options(path, chosen, chosen.chunks, columns, options)
-    fields = []
+    if columns is not None:
+        if not set(columns) <= set(chosen.blocks.available):
+            return None
+        further = tuple(name for name in further if name in chosen.blocks.available)
+    needed, fields = None if columns is None else (*columns, *further), []
+    options = _options(path, chosen, chosen.chunks, needed, options)
 
     def watch(ions):
         fields.append(Field(ions))

@@ -36,6 +36,7 @@ class Consumer(Protocol):
 class BlockReader(Protocol):
     """A file of a format that can be read in blocks more than once."""
 
+    available: tuple[str, ...]
     n: int
     largest: int
     columns: tuple[str, ...]
@@ -176,6 +177,15 @@ class IonBlocks:
         self._warn_of_size(size, lambda: self.field.size)
         return consumer if self._strays is None else self.fed(make, *columns)
 
+    def column(self, name: str) -> Hits:
+        """One column of all ions, with coordinates if some ions are not detected, because of which they are needed."""
+        gathered = self.fed(lambda: _Gathered(len(self), (name,) if self.whole else (name, *_PLACES)), name)
+        columns: dict[str, Any] = gathered.columns
+        hits = Hits(**columns, source=self.source)
+        if hits.x is not None and hits.y is not None:
+            keep_strays(hits.x, hits.y, self._strays)
+        return hits
+
     def _told(self, names):
         """Blocks, whose ions are told to the progress."""
         for hits in self._reader.blocks(names, ROWS):
@@ -204,3 +214,20 @@ class IonBlocks:
             inside = np.isfinite(x) & np.isfinite(y) & ~self._strays
             self.field = Field(int(np.count_nonzero(inside)))
             self.field.add(x[inside], y[inside])
+
+
+class _Gathered:
+    """Columns of all ions."""
+
+    def __init__(self, ions: int, names: tuple[str, ...]) -> None:
+        self._ions, self._names, self._at = ions, names, 0
+        self.columns: dict[str, NDArray[Any]] = {}
+
+    def add(self, hits: Hits) -> None:
+        """Take the next block."""
+        for name in self._names:
+            values = getattr(hits, name)
+            if name not in self.columns:
+                self.columns[name] = np.empty((self._ions, *values.shape[1:]), values.dtype)
+            self.columns[name][self._at : self._at + len(hits)] = values
+        self._at += len(hits)

@@ -134,7 +134,10 @@ class MeasuredFile:
         return self._undistorted(_PACKAGE, content)
 
     def blocks(
-        self, columns: tuple[str, ...] | None = None, progress: Callable[[int, int], object] = lambda ions, of: None
+        self,
+        columns: tuple[str, ...] | None = None,
+        progress: Callable[[int, int], object] = lambda ions, of: None,
+        further: tuple[str, ...] = (),
     ) -> IonBlocks | None:
         """Blocks of the ions of a large file, all of which are used; None if it is to be read whole, see `ion_blocks`.
 
@@ -144,6 +147,8 @@ class MeasuredFile:
             Columns that are needed; by default all.
         progress : callable, optional
             Receives the number of ions of each block, and of the file.
+        further : tuple of str
+            Columns that are read if the file has them.
 
         Raises
         ------
@@ -153,7 +158,7 @@ class MeasuredFile:
         changed = (self.selects, self.peaks, self.undistort, self.exchange_axes, self.distance)
         if any(change not in (None, False) for change in changed) or self.is_map or not os.path.isfile(self.path):
             return None
-        return formats.ion_blocks(self.path, columns, progress=progress, **self._reading())
+        return formats.ion_blocks(self.path, columns, further=further, progress=progress, **self._reading())
 
     def measured(self, note: Callable[[str], None], read: Callable[..., Any] = formats.read) -> Hits | DetectorMap:
         """The ions that are used, for a map, or the map of the file; notes say which ions are those of `peaks`.

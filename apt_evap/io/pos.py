@@ -70,6 +70,8 @@ def chunk_pos(
 class PosBlocks:
     """A .pos file that is read in blocks as often as needed; the arguments are those of `read_pos`."""
 
+    available = WRITTEN
+    """Columns of the format."""
     largest = 0
     """Ions of the largest pulse; the format has no pulses."""
 

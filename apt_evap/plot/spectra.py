@@ -15,6 +15,7 @@ from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _MOST_BINS = 1_000_000
+_CHUNK = 1 << 18  # ions
 _MARGIN = 0.04  # of the range of masses, on both sides
 _OCCUPIED = 1e-3  # of the ions in 1 Da at the ends of the default range; background is less
 _WIDTH_OF_LABEL = 0.018  # of the axes: a rotated label in a figure of the default size
@@ -81,7 +82,11 @@ def spectrum(
         elements = [name for name in dict.fromkeys(names) if name in ISOTOPES]
     else:
         elements = [check_choice(name, "elements", ISOTOPES) for name in elements]
-    masses = [_masses(ions) for ions in spectra]
+    return _draw([_masses(ions) for ions in spectra], labels, ax, bin_width, limits, elements)[0]
+
+
+def _draw(masses, labels, ax, bin_width, limits, elements):
+    """Draw spectra of m/n; return the axes, and edges and counts of the bins."""
     bin_width = check_number(bin_width, "bin_width", above=0, unit="Da")
     low, high = _default_limits(masses) if limits is None else check_array(limits, "limits", (2,)).tolist()
     if not 0 <= low < high or (high - low) / bin_width > _MOST_BINS:
@@ -90,7 +95,7 @@ def spectrum(
             f"{high:g}"
         )
     edges = bin_width * np.arange(np.floor(low / bin_width), np.ceil(high / bin_width) + 1)
-    counts = [np.histogram(mass, edges)[0] for mass in masses]
+    counts = [_counts_between(mass, edges) for mass in masses]
     scales = [1.0] if len(masses) == 1 else [1 / (bin_width * len(mass)) for mass in masses]
     if ax is None:
         ax = new_figure((8.0, 4.0)).subplots()
@@ -113,7 +118,7 @@ def spectrum(
     ax.set_axisbelow(True)
     if any(labels):
         ax.legend(loc="upper center", frameon=False, fontsize="small", ncols=min(len(labels), 3))
-    return ax
+    return ax, edges, counts
 
 
 def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
@@ -128,13 +133,16 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
         rows = zip(ranges.names, ranges.low.tolist(), ranges.high.tolist(), strict=True)
         named = [(name, name.replace("$", r"\$"), [(low, high)]) for name, low, high in rows]
     intervals = [interval for _, _, parts in named for interval in parts]
+    labels = [None] if labels is None else list(labels)
+    if len(labels) != 1:
+        raise ValueError(f"spectrum needs ions, with one label each, got 1 and {len(labels)}")
+    mass = _masses(spectrum_of_ions.hits)
     if limits is None:
-        low, high = _default_limits([_masses(spectrum_of_ions.hits)])
+        low, high = _default_limits([mass])
         ends = np.array(intervals or [(low, high)])
         margin = _MARGIN * (max(high, ends.max()) - min(low, ends.min()))
         limits = max(min(low, ends.min() - margin), 0.0), max(high, ends.max() + margin)
-    ax = spectrum(spectrum_of_ions.hits, labels, ax, bin_width=bin_width, limits=limits, elements=())
-    edges = bin_width * np.arange(np.floor(limits[0] / bin_width), np.ceil(limits[1] / bin_width) + 1)
+    ax, edges, (count,) = _draw([mass], labels, ax, bin_width, limits, ())
     ax.stairs(
         spectrum_of_ions.background(edges),
         edges,
@@ -144,8 +152,6 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
         label="background",
         zorder=3,
     )
-    mass = _masses(spectrum_of_ions.hits)
-    count = np.histogram(mass, edges)[0]
     formulas = list(dict.fromkeys(formula for formula, _, _ in named))
     places: list[float] = []
     for formula, text, parts in named:
@@ -197,13 +203,46 @@ def _masses(ions):
     mass = mass[ions.detected & np.isfinite(mass)]
     if not len(mass):
         raise ValueError(f"a spectrum needs detected ions, got none of {ions!r}")
-    return mass.astype(np.float64)
+    return mass
+
+
+def _chunks(mass):
+    """The m/n in parts, as float64: all at once would be temporary arrays of many ions."""
+    for start in range(0, len(mass), _CHUNK):
+        yield mass[start : start + _CHUNK].astype(np.float64)
+
+
+def _counts_between(mass, edges):
+    """Number of m/n in bins between edges in even steps, as `numpy.histogram`, which sorts them."""
+    number = len(edges) - 1
+    total = np.zeros(number, np.int64)
+    for part in _chunks(mass):
+        inside = part[(part >= edges[0]) & (part <= edges[-1])]
+        at = ((inside - edges[0]) * (number / (edges[-1] - edges[0]))).astype(np.int64)
+        np.minimum(at, number - 1, out=at)
+        # rounding is less than a bin
+        at -= inside < edges[at]
+        at += (inside >= edges[at + 1]) & (at < number - 1)
+        total += np.bincount(at, minlength=number)
+    return total
+
+
+def _in_daltons(mass):
+    """Whole numbers below m/n, increasing, and the number of ions of each."""
+    low, high = np.floor(float(mass.min())), np.floor(float(mass.max()))
+    if high - low > _MOST_BINS:
+        return np.unique(np.floor(mass.astype(np.float64)), return_counts=True)
+    counts = np.zeros(int(high - low) + 1, np.int64)
+    for part in _chunks(mass):
+        counts += np.bincount((np.floor(part) - low).astype(np.int64), minlength=len(counts))
+    occupied = np.flatnonzero(counts)
+    return low + occupied, counts[occupied]
 
 
 def _default_limits(masses):
     lows, highs = [], []
     for mass in masses:
-        intervals, counts = np.unique(np.floor(mass), return_counts=True)
+        intervals, counts = _in_daltons(mass)
         empty = intervals[-1] - intervals[0] + 1 - len(intervals)
         background = np.median(np.pad(counts, (0, int(empty)))) if empty < len(intervals) else 0.0
         threshold = max(_OCCUPIED * len(mass), background + _SIGNIFICANT * np.sqrt(background))

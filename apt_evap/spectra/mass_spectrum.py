@@ -252,8 +252,13 @@ class Spectrum:
         masses, shares = self._abundances.lines(ion.formula)
         return float(masses[int(np.argmax(shares))]) / ion.charge
 
-    def losses(self) -> DeadTimeLoss:
+    def losses(self, alone: NDArray[np.bool_] | None = None) -> DeadTimeLoss:
         """Losses by dead time: isotopes of single ions against those of pulses with several.
+
+        Parameters
+        ----------
+        alone : ndarray of bool, optional
+            Whether each ion is the only one of its pulse, shape (n,); by default from `pulse_id`.
 
         Raises
         ------
@@ -262,9 +267,10 @@ class Spectrum:
         """
         if not isinstance(self._source, _Named):
             raise ValueError("losses need the ions of a spectrum, got those of ranges")
-        (pulse,) = self.hits.require("pulse_id")
-        _, place, number = np.unique(pulse, return_inverse=True, return_counts=True)
-        alone = number[place] == 1
+        if alone is None:
+            (pulse,) = self.hits.require("pulse_id")
+            _, place, number = np.unique(pulse, return_inverse=True, return_counts=True)
+            alone = number[place] == 1
         return self._source.losses(_detected(self.hits[alone]), _detected(self.hits[~alone]), self.composition)
 
     def background(self, edges: Floats) -> Floats:
@@ -529,7 +535,7 @@ def _detected(hits):
     """m/n of the detected ions between `LOWEST` and `HIGHEST` [Da]."""
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
-        return mass[hits.detected & (mass > LOWEST) & (mass < HIGHEST)].astype(np.float64)
+        return mass[hits.detected & (mass > LOWEST) & (mass < HIGHEST)]
 
 
 def _warn_of_masses(hits):

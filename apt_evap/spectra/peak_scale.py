@@ -11,6 +11,7 @@ LOWEST, HIGHEST = 0.5, 310.0
 BINS = 3
 """Bins of a histogram per standard deviation of a peak."""
 _STEP = 1e-4  # of ln m/n, of the histogram in which widths are measured
+_CHUNK = 1 << 18  # ions whose places are computed at a time, for little memory
 _STRONGEST = 30  # peaks whose widths are measured
 _FEWEST = 60  # ions of one half of such a peak
 _WIDTHS = (1e-4, 5e-3)  # of ln m/n; standard deviations are between these
@@ -65,8 +66,18 @@ class PeakScale:
 
     def counts(self, mass: Floats) -> Floats:
         """Number of ions in each bin, shape (size,)."""
-        rows = np.rint(self.bins(mass)).astype(np.int64)
-        return np.bincount(np.clip(rows, 0, self.size - 1), minlength=self.size).astype(float)
+        return _counted(
+            mass, lambda part: np.clip(np.rint(self.bins(part)).astype(np.int64), 0, self.size - 1), self.size
+        )
+
+
+def _counted(mass, place, size):
+    """Number of ions at each place, by a function that gives the places of some of them."""
+    counts = np.zeros(size, np.int64)
+    for start in range(0, len(mass), _CHUNK):
+        found = np.bincount(place(mass[start : start + _CHUNK].astype(np.float64)), minlength=size)
+        counts = found + np.pad(counts, (0, len(found) - len(counts)))
+    return counts.astype(float)
 
 
 def _widths(mass):
@@ -75,7 +86,7 @@ def _widths(mass):
     from scipy.signal import find_peaks
 
     edges = np.arange(math.log(LOWEST), math.log(HIGHEST), _STEP)
-    counts = np.bincount(((np.log(mass) - edges[0]) / _STEP).astype(int), minlength=len(edges)).astype(float)
+    counts = _counted(mass, lambda part: ((np.log(part) - edges[0]) / _STEP).astype(int), len(edges))
     smooth = gaussian_filter1d(counts, 1.5)
     # the square root of counts has the same noise everywhere; 5.3 bins are effectively in the filter
     tops, found = find_peaks(2 * np.sqrt(5.3 * smooth + 0.375), prominence=12, distance=20)

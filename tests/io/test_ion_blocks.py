@@ -11,6 +11,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.io import formats, ion_blocks
 from apt_evap.io.measured_file import MeasuredFile
+from apt_evap.plot import spectra
 
 pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
 N = 20_000
@@ -84,7 +85,6 @@ FILES = {
     "pulses of every ion": with_change(_of_every_ion),
     "pulses that are not consistent": with_change(lambda rows, values: rows.__setitem__((slice(100, 103), 10), 9)),
     "truncated": with_change(_none)[:-60],
-    "little": with_change(_none),
 }
 OPTIONS = {
     "truncated": ["--partial"],
@@ -159,6 +159,41 @@ def test_blocks_give_the_map_of_the_whole_file(tmp_path, monkeypatch, blocks_of,
     assert expected["detected"] > 0
 
 
+@pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
+def test_blocks_give_the_spectrum_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
+    """The picture, too; what is said of pulses and voltages, which a spectrum does not need, may be missing."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.epos").write_bytes(FILES[name])
+    words = ["a.epos", *OPTIONS.get(name, ())]
+    whole = None
+    for rows in (None, 977, 1 << 20):
+        blocks_of(rows)
+        given = [answers(capsys, "spectrum", *words, "-o", "s.png", "--json")[:2], (tmp_path / "s.png").read_bytes()]
+        given.append(answers(capsys, "composition", *words, "--element", "Al,H", "--json")[:2])
+        whole = whole or given
+        assert given == whole, rows
+    assert json.loads(whole[0][1])["ions"]
+    assert json.loads(whole[2][1])["composition"]
+
+
+def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
+    """Isotopes that are lost in pulses of several ions, which a note of a composition says."""
+    monkeypatch.chdir(tmp_path)
+    rows = np.concatenate([rows_of(seed=seed) for seed in range(5)]).astype(">u4")
+    random = np.random.default_rng(2)
+    mass = random.choice([62.93, 64.93], len(rows), p=[0.69, 0.31]) * random.normal(1, 3e-4, len(rows))
+    second = rows[:, 10] == 0
+    mass[second] = np.where(random.random(second.sum()) < 0.8, 64.93, 62.93) * random.normal(1, 3e-4, second.sum())
+    rows.view(">f4")[:, 3] = mass
+    (tmp_path / "a.epos").write_bytes(rows.tobytes())
+    given = []
+    for size in (None, *SIZES[1:]):
+        blocks_of(size)
+        given.append(answers(capsys, "composition", "a.epos", "--element", "Cu"))
+    assert "note" in given[0][2]
+    assert all(one == given[0] for one in given)
+
+
 def test_a_pos_is_read_in_blocks(tmp_path, monkeypatch, capsys, blocks_of):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.pos").write_bytes(np.ascontiguousarray(rows_of()[:, :4]).tobytes())
@@ -210,3 +245,18 @@ def test_only_plain_answers_are_made_of_blocks(tmp_path, blocks_of):
     assert MeasuredFile(str(path)).blocks() is None
     blocks_of(None)
     assert MeasuredFile(str(path)).blocks() is None
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_counts_of_a_picture_are_those_of_numpy(dtype):
+    """Also of m/n at edges of bins, and far outside."""
+    random = np.random.default_rng(1)
+    for width in (0.02, 0.05, 0.1):
+        edges = width * np.arange(np.floor(3.3 / width), np.ceil(61.7 / width) + 1)
+        mass = np.concatenate([random.uniform(0, 90, 300_000), edges, np.nextafter(edges, 0), [1e30, -5.0]]).astype(
+            dtype
+        )
+        assert np.array_equal(spectra._counts_between(mass, edges), np.histogram(mass.astype(float), edges)[0])
+    for values in (mass, mass[np.abs(mass) < 1e3]):
+        expected = np.unique(np.floor(values.astype(float)), return_counts=True)
+        assert all(np.array_equal(*pair) for pair in zip(spectra._in_daltons(values), expected, strict=True))
