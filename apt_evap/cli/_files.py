@@ -49,15 +49,16 @@ def blocks_of(
     columns: tuple[str, ...] | None = None,
     *,
     further: tuple[str, ...] = (),
-    ranges: bool = True,
+    without: tuple[str, ...] = (),
 ) -> Any:
     """Blocks of the ions of a large FILE, which is read twice, with progress; None for other files.
 
-    `columns` are needed, `further` ones are read if the file has them; without `ranges` these select no ions.
+    `columns` are needed, `further` ones are read if the file has them; options `without` an effect select no ions.
     """
     if options.file.endswith(".unfinished"):
         return None
-    file = file_of(options) if ranges else replace(file_of(options), ranges=None)
+    changes: dict[str, Any] = dict.fromkeys(without)
+    file = replace(file_of(options), **changes)
     return file.blocks(columns, reading_progress(2, quiet=getattr(options, "quiet", False)), further)
 
 

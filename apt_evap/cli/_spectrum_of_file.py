@@ -75,7 +75,7 @@ def alone_of(options: argparse.Namespace) -> Any:
 
     from apt_evap.cli._files import blocks_of
 
-    blocks = blocks_of(options, ("pulse_id",), ranges=False)
+    blocks = blocks_of(options, ("pulse_id",), without=("ranges",))
     if blocks is None:
         return None
     parts: list[Any] = []
@@ -93,8 +93,8 @@ def _masses_of_large_file(options):
     """Masses of all ions of a large file, 4 bytes each; None for another one, or without masses of detected ions."""
     from apt_evap.cli._files import blocks_of
 
-    blocks = blocks_of(options, ("mass_to_charge",), further=("x", "y"), ranges=False)
+    blocks = blocks_of(options, ("mass_to_charge",), further=("x", "y"), without=("ranges",))
     if blocks is None:
         return None
-    hits = blocks.column("mass_to_charge")
+    hits = blocks.gathered("mass_to_charge")
     return hits if (hits.detected & (hits.mass_to_charge > 0)).any() else None

@@ -118,7 +118,7 @@ def execute(options: argparse.Namespace) -> int:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     picture = output.with_suffix(".png") if options.picture is None else picture_path(options.picture)
     check_output(picture, is_picture, options.force)
-    hits, known, crystal = _ions(options)
+    hits, known, crystal = _ions(options, output)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
@@ -260,7 +260,7 @@ def _tell_check(options, reconstruction, material, axis, assumed):
     return found | {"sizes": [size._asdict() for size in sizes]}
 
 
-def _ions(options):
+def _ions(options, output):
     """Ions of the file, the constants that it determines, and the orientation of a run."""
     from apt_evap.cli._files import in_real_units, read
     from apt_evap.config.perturbation_text import read_perturbation
@@ -269,7 +269,8 @@ def _ions(options):
     from apt_evap.reconstruction.constants import run_constants
     from apt_evap.simulation.run import Run
 
-    content = read(options)
+    if (content := _ions_of_large_file(options, output)) is None:
+        content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
         perturbation = run.first_perturbation
@@ -282,6 +283,20 @@ def _ions(options):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
     return content, {}, None
+
+
+def _ions_of_large_file(options, output):
+    """Ions of a large file, with the columns that a .pos needs; None for other files, or if more is needed."""
+    from apt_evap.cli._files import blocks_of
+
+    if output.suffix.lower() != ".pos" or options.shape != "cap" or options.labels:
+        return None
+    needed = ("mass_to_charge", "voltage", "pulse_voltage")
+    # the distance is that of the reconstruction, and gives no masses
+    blocks = blocks_of(options, ("x", "y"), further=needed, without=("ranges", "distance"))
+    if blocks is None or not blocks.field.ions or (options.distance is not None and needed[0] not in blocks.columns):
+        return None
+    return blocks.gathered("x", "y", *(name for name in needed if name in blocks.columns))
 
 
 def _settings(options, known):

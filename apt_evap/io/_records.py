@@ -288,7 +288,8 @@ def finite_rows(columns: Any, n: int) -> Any:
         if values is not None and dtype == "f4":
             with np.errstate(over="ignore"):
                 good = np.isfinite(values.astype(np.float32, copy=False))
-            finite &= good if good.ndim == 1 else good.all(axis=1)
+            for column in good.reshape(n, -1).T:  # faster than `all` along rows of three
+                finite &= column
     return finite
 
 

@@ -177,9 +177,9 @@ class IonBlocks:
         self._warn_of_size(size, lambda: self.field.size)
         return consumer if self._strays is None else self.fed(make, *columns)
 
-    def column(self, name: str) -> Hits:
-        """One column of all ions, with coordinates if some ions are not detected, because of which they are needed."""
-        gathered = self.fed(lambda: _Gathered(len(self), (name,) if self.whole else (name, *_PLACES)), name)
+    def gathered(self, *names: str) -> Hits:
+        """Columns of all ions, and their coordinates if some are not detected, because of which they are needed."""
+        gathered = self.fed(lambda: _Gathered(len(self), names if self.whole else (*names, *_PLACES)), *names)
         columns: dict[str, Any] = gathered.columns
         hits = Hits(**columns, source=self.source)
         if hits.x is not None and hits.y is not None:
@@ -220,7 +220,7 @@ class _Gathered:
     """Columns of all ions."""
 
     def __init__(self, ions: int, names: tuple[str, ...]) -> None:
-        self._ions, self._names, self._at = ions, names, 0
+        self._ions, self._names, self._at = ions, dict.fromkeys(names), 0
         self.columns: dict[str, NDArray[Any]] = {}
 
     def add(self, hits: Hits) -> None:

@@ -19,6 +19,7 @@ _COLORS = ("C0", "C1", "C2", "C3", "C4", "C5", "C6", "0.6")
 _MOST = 7  # species with a colour of their own
 _DOTS = 20_000  # ions from the side: more hide each other
 _SECTIONS = 60  # along the depth, of at least FEWEST ions
+_POINTS = 1_000_000  # of a line
 FEWEST = 50
 """Fewest ions of a picture."""
 _CORE = 0.5  # of the field of view, in which profiles are counted
@@ -79,10 +80,11 @@ def reconstruction(
         _composition(axes[3], names, species)
     else:
         _density(axes[2], result)
-        axes[3].plot(result.depths, result.radii, color="C0")
+        every = slice(None, None, -(-len(result) // _POINTS))  # many more than the pixels of the picture
+        axes[3].plot(result.depths[every], result.radii[every], color="C0")
         axes[3].set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
     if title is None:
-        x, y, z = np.ptp(result.positions, axis=0)
+        x, y, z = (np.ptp(column) for column in result.positions.T)
         title = f"{len(result):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"
     figure.suptitle(title, parse_math=False)
     return axes

@@ -14,6 +14,7 @@ from apt_evap.detection.microscope.lens import LAST_ANGLE
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings
 
+_PART = 1 << 15  # ions whose positions are computed at a time
 _RIGHT_ANGLE = math.pi / 2
 _LAST_ON_LENS = math.radians(LAST_ANGLE)
 
@@ -91,9 +92,13 @@ class CapGeometry:
 
     def places(self, hits: Hits, radii: Floats) -> tuple[Floats, Floats]:
         """Place of each ion on the cap, x / R and y / R, shape (n, 2), and its angle on the cap [rad], shape (n,)."""
-        x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
+        return self._places(hits, slice(None), radii, self.lens_voltages(hits))
+
+    def _places(self, hits, rows, radii, voltages):
+        """`places` of some rows of the ions."""
+        x, y = (column[rows].astype(np.float64) for column in hits.require("x", "y"))
         rho = np.hypot(x, y)
-        angles = self.angles(rho, radii, self.lens_voltages(hits))
+        angles = self.angles(rho, radii, voltages)
         sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
         return np.column_stack([sine_over_rho * x, sine_over_rho * y]), angles
 
@@ -114,16 +119,24 @@ class CapGeometry:
         ndarray
             x, y and depth [nm], shape (n, 3).
         """
-        places, angles = self.places(hits, radii)
-        # depth below the apex in units of R, 1 - cos(theta)
-        below = 2 * np.sin(angles / 2) ** 2
-        if shifts is not None:
-            places = places + shifts
-            squares = np.minimum((places**2).sum(axis=1), 1.0)
-            below = squares / (1 + np.sqrt(1 - squares))
-        swept, widening = self.cross_sections(radii, self.lens_voltages(hits))
-        depths = _apex_depths(radii, self.volume, swept, widening)
-        return np.column_stack([radii[:, None] * places, depths + radii * below])
+        voltages = self.lens_voltages(hits)
+        swept, widening = self.cross_sections(radii, voltages)
+        positions = np.empty((len(radii), 3))
+        positions[:, 2] = _apex_depths(radii, self.volume, swept, widening)
+        # all at once with a lens; otherwise in parts, whose temporary arrays stay in the cache
+        step = _PART if self.lens is None else max(len(radii), 1)
+        for start in range(0, len(radii), step):
+            rows = slice(start, start + step)
+            places, angles = self._places(hits, rows, radii[rows], voltages)
+            # depth below the apex in units of R, 1 - cos(theta)
+            below = 2 * np.sin(angles / 2) ** 2
+            if shifts is not None:
+                places = places + shifts[rows]
+                squares = np.minimum((places**2).sum(axis=1), 1.0)
+                below = squares / (1 + np.sqrt(1 - squares))
+            positions[rows, :2] = radii[rows, None] * places
+            positions[rows, 2] += radii[rows] * below
+        return positions
 
     def cross_sections(self, radii: Floats | None = None, voltages: Floats | None = None) -> tuple[Floats, Floats]:
         """Areas in units of R^2 that the cap sweeps by its recession, and loses by its widening; arrays with a lens."""
@@ -151,7 +164,7 @@ def voltages_of(hits: Hits) -> Floats:
 
 def depths_below_apex(positions: Floats, radii: Floats) -> Floats:
     """Depth below the apex of ions on the cap [nm], shape (n,)."""
-    squares = (positions[:, :2] ** 2).sum(axis=1)
+    squares = positions[:, 0] ** 2 + positions[:, 1] ** 2
     return squares / (radii + np.sqrt(np.maximum(radii * radii - squares, 0.0)))
 
 

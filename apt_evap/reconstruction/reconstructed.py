@@ -274,7 +274,7 @@ class Reconstruction:
         return len(self.positions)
 
     def __repr__(self) -> str:
-        extents = " x ".join(f"{extent:.1f}" for extent in np.ptp(self.positions, axis=0))
+        extents = " x ".join(f"{np.ptp(column):.1f}" for column in self.positions.T)
         low, high = self.radii.min(), self.radii.max()
         radius = f"R {low:.1f} nm" if low == high else f"R {low:.1f} to {high:.1f} nm"
         names = ("field_factor", "evaporation_field", "initial_radius", "shank_angle", "compression", "efficiency")
@@ -311,8 +311,8 @@ def cap_reconstruction(
 
 def _field_of_view(hits, settings):
     """Ions within the field of view, which of the hits these are, and its radius [mm]."""
-    x, y = (column.astype(np.float64) for column in hits.require("x", "y"))
-    rho = np.hypot(x, y)
+    x, y = hits.require("x", "y")
+    rho = np.hypot(x, y, dtype=np.float64)
     rows, radius = hits.detected, settings.detector_radius
     if radius is not None:
         with np.errstate(invalid="ignore"):
@@ -323,7 +323,7 @@ def _field_of_view(hits, settings):
     if settings.area is not None:
         rim = math.sqrt(settings.area / math.pi)
     else:
-        rim = float(rho[rows].max()) if radius is None else radius
+        rim = float(rho.max(where=rows, initial=0.0)) if radius is None else radius
     if rim == 0:
         raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
     return hits if rows.all() else hits[rows], rows, rim

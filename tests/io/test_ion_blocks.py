@@ -9,9 +9,12 @@ import pytest
 
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
+from apt_evap.detection.hits import Hits
 from apt_evap.io import formats, ion_blocks
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.plot import spectra
+from apt_evap.reconstruction import cap_geometry
+from apt_evap.reconstruction.reconstruct import reconstruct
 
 pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
 N = 20_000
@@ -260,3 +263,35 @@ def test_counts_of_a_picture_are_those_of_numpy(dtype):
     for values in (mass, mass[np.abs(mass) < 1e3]):
         expected = np.unique(np.floor(values.astype(float)), return_counts=True)
         assert all(np.array_equal(*pair) for pair in zip(spectra._in_daltons(values), expected, strict=True))
+
+
+@pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
+def test_blocks_give_the_reconstruction_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.epos").write_bytes(FILES[name])
+    constants = ["--element", "Al", "--distance", "90", "--efficiency", "0.5"]
+    if name == "negative":  # voltages
+        constants += ["--radius", "30"]
+    whole = None
+    for rows in (None, 977, 1 << 14):
+        blocks_of(rows)
+        given = [answers(capsys, "reconstruct", "a.epos", *constants, "-o", "r.pos", "--force")[:2]]
+        given += [(tmp_path / file).read_bytes() for file in ("r.pos", "r.png")]
+        whole = whole or given
+        assert given == whole, rows
+    assert whole[0][0] == 0
+
+
+def test_positions_in_parts_are_those_of_all_ions(monkeypatch):
+    """A reconstruction computes positions of some ions at a time: no bit depends on it."""
+    random = np.random.default_rng(2)
+    x, y = random.uniform(-20, 20, (2, 5000)).astype(np.float32)
+    hits = Hits(x=x, y=y, voltage=np.linspace(3e3, 5e3, 5000))
+    found = {}
+    for part in (1 << 20, 1 << 15, 777, 3):
+        monkeypatch.setattr(cap_geometry, "_PART", part)
+        for projection in ("equidistant", "compressed", "bas"):
+            result = reconstruct(hits, element="Al", distance=90.0, protocol=projection if projection == "bas" else "cap",
+                                 **({} if projection == "bas" else {"projection": projection}))  # fmt: skip
+            found.setdefault(projection, set()).add(result.positions.tobytes())
+    assert [len(bits) for bits in found.values()] == [1, 1, 1]
