@@ -291,7 +291,7 @@ def test_positions_in_parts_are_those_of_all_ions(monkeypatch):
     for part in (1 << 20, 1 << 15, 777, 3):
         monkeypatch.setattr(cap_geometry, "_PART", part)
         for projection in ("equidistant", "compressed", "bas"):
-            result = reconstruct(hits, element="Al", distance=90.0, protocol=projection if projection == "bas" else "cap",
-                                 **({} if projection == "bas" else {"projection": projection}))  # fmt: skip
+            kind = {"protocol": "bas"} if projection == "bas" else {"protocol": "cap", "projection": projection}
+            result = reconstruct(hits, element="Al", distance=90.0, **kind)
             found.setdefault(projection, set()).add(result.positions.tobytes())
     assert [len(bits) for bits in found.values()] == [1, 1, 1]

@@ -66,3 +66,19 @@ def test_what_a_map_loads():
 
 def test_the_test_sees_what_is_loaded():
     assert {"matplotlib", "scipy.optimize"} <= loaded("import matplotlib, scipy.optimize")
+
+
+@pytest.mark.parametrize(
+    ("code", "seconds"),
+    [
+        ("import apt_evap", 0.15),
+        (HELP.format("['--help']"), 0.15),
+        ("import apt_evap as ae\nae.load('run.h5').hits(ae.RollUp(0.2)).map()", 1.0),
+    ],
+    ids=["package", "help", "first map of a run"],
+)
+def test_the_start_is_short(small_tip, tmp_path, code, seconds):
+    """Processor time; the least of five, because other programs make each longer and none shorter."""
+    ae.Simulation(small_tip, seed=1, n_threads=1).run(300, progress=False).save(tmp_path / "run.h5")
+    code = f"import os\nos.chdir({str(tmp_path)!r})\n{code}\nimport time\nprint(time.process_time())"
+    assert min(float(printed(code).split()[-1]) for _ in range(5)) < seconds
