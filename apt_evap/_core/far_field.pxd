@@ -23,5 +23,5 @@ cdef class FarField:
     cdef void expand(self, Expansion* expansion, const double* field) noexcept nogil
 
 
-cdef void add_expanded(const Expansion* expansion, Index n, const double* positions, const Index* which,
-                       double* field) noexcept nogil
+cdef void add_expanded(const Expansion* expansion, const double* origin, Index m, const float* targets,
+                       float* field) noexcept nogil

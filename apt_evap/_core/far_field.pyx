@@ -20,8 +20,7 @@ from apt_evap._core.index cimport Index
 
 cdef extern from "kernels.h":
     const int SINGLE_LANES
-    void polynomial_field(int, const float*, const float*, const float*, const float*,
-                          float*, float*, float*) noexcept nogil
+    void add_polynomials(int, const float*, const float*, float, Index, const float*, float*) noexcept nogil
     void weighted_sum(Index, int, const double*, const double*, Index, double*) noexcept nogil
 
 N_SAMPLES, POTENTIAL_ORDER = SAMPLES, ORDER
@@ -107,27 +106,15 @@ def _matrix():
     return np.ascontiguousarray(np.concatenate(by_component, axis=1))
 
 
-cdef void add_expanded(const Expansion* expansion, Index n, const double* positions, const Index* which,
-                       double* field) noexcept nogil:
-    # Adds the field at the points (., 3) with the indices `which`.
-    cdef float[16] x, y, z, ex, ey, ez
-    cdef double scale = 1.0 / expansion.radius
-    cdef const double* centre = expansion.centre
-    cdef Index first = 0, lane, m, i
-    while first < n:
-        m = min(<Index>SINGLE_LANES, n - first)
-        for lane in range(SINGLE_LANES):
-            i = 3 * which[first + min(lane, m - 1)]
-            x[lane] = <float>((positions[i] - centre[0]) * scale)
-            y[lane] = <float>((positions[i + 1] - centre[1]) * scale)
-            z[lane] = <float>((positions[i + 2] - centre[2]) * scale)
-        polynomial_field(ORDER - 1, expansion.coefficients, x, y, z, ex, ey, ez)
-        for lane in range(m):
-            i = 3 * which[first + lane]
-            field[i] += ex[lane]
-            field[i + 1] += ey[lane]
-            field[i + 2] += ez[lane]
-        first += SINGLE_LANES
+cdef void add_expanded(const Expansion* expansion, const double* origin, Index m, const float* targets,
+                       float* field) noexcept nogil:
+    # Adds the field at m places relative to the origin, in the layout of the kernels.
+    cdef float[3] centre
+    cdef int axis
+    for axis in range(3):
+        centre[axis] = <float>(expansion.centre[axis] - origin[axis])
+    add_polynomials(ORDER - 1, expansion.coefficients, centre, <float>(1.0 / expansion.radius), m,
+                    targets, field)
 
 
 cdef class FarField:
@@ -173,9 +160,10 @@ cdef class FarField:
 
     def fields(self, const double[:, ::1] positions):
         """Field at points in the ball [nm], shape (n, 3)."""
-        cdef Index n = positions.shape[0]
-        cdef double[:, ::1] field = np.zeros((n, 3))
-        cdef Index[::1] which = np.arange(n, dtype=np.int64)
+        n = len(positions)
+        cdef Index width = (n + SINGLE_LANES - 1) // SINGLE_LANES * SINGLE_LANES
+        cdef float[:, ::1] targets = np.zeros((3, width), np.float32), field = np.zeros((3, width), np.float32)
+        np.asarray(targets)[:, :n] = (np.asarray(positions) - np.array(self.expansion.centre)).T
         if n:
-            add_expanded(&self.expansion, n, &positions[0, 0], &which[0], &field[0, 0])
-        return np.asarray(field)
+            add_expanded(&self.expansion, self.expansion.centre, width, &targets[0, 0], &field[0, 0])
+        return np.asarray(field, np.float64)[:, :n].T

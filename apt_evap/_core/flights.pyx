@@ -12,6 +12,7 @@ The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikk
 """
 
 from libc.math cimport INFINITY, NAN, sqrt
+from libc.string cimport memcpy
 from libc.stdlib cimport free, malloc
 
 import numpy as np
@@ -21,7 +22,8 @@ from apt_evap._core.index cimport Index
 from apt_evap._core.journal cimport Journal
 from apt_evap._core.octree cimport Octree
 from apt_evap._core.sources cimport (
-    SingleSources, Sources, single_field, single_free, single_pad, sources_field, sources_free, sources_init,
+    Nodes, SingleSources, Sources, nodes_reserve, single_field, single_free, single_pad, single_part, sources_field,
+    sources_free, sources_init,
 )
 
 cdef extern from "elementary.h":
@@ -34,6 +36,11 @@ cdef extern from "kernels.h":
     void bundle_atoms(Index, Index, const float*, Index, const float*, float*) noexcept nogil
     void bundle_cells(Index, Index, const float*, Index, const float*, float*) noexcept nogil
     void weighted_sum(Index, int, const double*, const double*, Index, double*) noexcept nogil
+    void stage_places(Index, double, double, const double*, const double*, const double*, double*) noexcept nogil
+    void into_lanes(Index, const double*, const double*, float*) noexcept nogil
+    void out_of_lanes(Index, double, const float*, double*) noexcept nogil
+    void enclosing_ball(Index, const double*, const double*, const double*, double, double, double*) noexcept nogil
+    void relative_lengths(Index, double, double, const double*, const double*, const double*, double*) noexcept nogil
 
 
 cdef extern from *:
@@ -50,6 +57,8 @@ cdef extern from *:
 cdef enum:
     STAGES = 9
     PARTS = 3            # of a step, each with its own expansion
+    PADDED = (SAMPLES + 15) // 16 * 16   # samples in full vector lanes
+    LEVELS = 2           # nested balls, each with an expansion of the field of the sources beyond
     FEWEST = 6           # flights of a bundle from which an expansion of the field costs less than sums for each flight
     ION_LEFT = 0
     ION_NEVER_LEFT = 1   # also the value during the flight
@@ -70,7 +79,7 @@ cdef double SCOUT_TOLERANCE = 3e-2
 # 2.75 / 3 / 3.5, places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in
 # 1.02 / 1.14 / 1.21 / 1.40 ms an ion.
 cdef double FAR = 3.0
-cdef double SPLIT = 0.8
+cdef double SPLIT = 0.9
 
 # A flight alone has one list of sources for several steps: at the start for a ball of AT_START lengths, later for the
 # way of AHEAD times the next step. Inside such a ball, most places see the cells under smaller angles than the
@@ -81,6 +90,13 @@ cdef double SPLIT = 0.8
 cdef double AHEAD = 5.0
 cdef double AT_START = 6.0
 cdef double LONE = 1.25
+
+# Sources far from a bundle are summed once for balls that contain one or some of its steps: at the start for balls of
+# AROUND lengths, later for a ball around the step, unless it is larger than LARGEST lengths. If there are at most FEW
+# sources, they are summed for every flight.
+cdef double[2] AROUND = [6.0, 2.0]
+cdef double LARGEST = 30.0
+cdef Index FEW = 8
 
 cdef Index MOST_REFUSED = 12  # successive steps that hit an atom, each a tenth of the one before: it starts at one
 
@@ -105,6 +121,7 @@ cdef double[81] STAGE = [
 cdef double[9] VELOCITY = [
     223 / 7938.0, 0, 5875 / 36288.0, 4625 / 21168.0, 41 / 224.0, 4625 / 21168.0, 5875 / 36288.0, 223 / 7938.0, 0,
 ]
+cdef double[9] ENDS = [1, 0, 0, 0, 0, 0, 0, 0, 1]
 # Differences to the embedded solution of order 6.
 cdef double[9] POSITION_ERROR = [
     -0.044557986852984274, 0, 0.10965442077101599, -0.14620589436135464, 0.1315853049252192, -0.06265966901200913,
@@ -114,6 +131,22 @@ cdef double[9] VELOCITY_ERROR = [
     -0.044557986852984274, 0, 0.12183824530112887, -0.2088655633733638, 0.2631706098504384, -0.2088655633733638,
     0.12183824530112887, 0.10544201314701572, -0.15,
 ]
+
+
+cdef struct Level:
+    # A ball that contains some steps, the field inside of all sources beyond FAR radii, and the nodes of all others.
+    double[4] ball
+    Expansion expansion
+    Nodes rest
+
+
+cdef bint is_inside(const double* inner, const double* outer) noexcept nogil:
+    # Whether a ball lies in another one.
+    cdef double s = 0.0, space = outer[3] - inner[3]
+    cdef int axis
+    for axis in range(3):
+        s += (inner[axis] - outer[axis]) ** 2
+    return space >= 0.0 and s <= space * space
 
 
 cdef class Flights:
@@ -144,6 +177,10 @@ cdef class Flights:
     cdef Index n_replayed
     cdef Sources sources
     cdef SingleSources near, far
+    cdef SingleSources[PARTS] inside, outside   # those near each part of the step, and those near the other parts only
+    cdef Nodes everything                       # the root of the tree
+    cdef Level[LEVELS] levels
+    cdef int n_levels                           # that contain the present step
     cdef FarField far_field
     cdef Expansion[PARTS] expansions
     cdef int n_parts           # 0 if the sources are not expanded
@@ -153,18 +190,40 @@ cdef class Flights:
     cdef double[3] centre
     cdef Index max_steps, fewest
     cdef Index capacity
-    cdef double* work          # (STAGES + 4, capacity, 3): accelerations, then position, velocity, trial position, sums
-    cdef float* lanes          # (6, capacity + SINGLE_LANES): places relative to the centre of the sources, and fields
-    cdef Index* flying         # (capacity,) flights that have not ended
+    cdef double* work          # the rows that follow, each (3, width), of at most `capacity` flights
+    cdef double* a             # accelerations of the stages
+    cdef double* x
+    cdef double* v
+    cdef double* trial         # places of a stage
+    cdef double* sums
+    cdef double* origin        # places at the start
+    cdef double* ratios        # (width,)
+    cdef double* spare         # (12, width)
+    cdef double* none          # zeros
+    cdef float* lanes          # (6, width): places relative to the centre of the sources, and fields
+    cdef Index* flying         # (n_flying,) numbers of the flights that have not ended
+    cdef Index n_flying, width
+    cdef bint alone            # whether the group has one flight
     cdef readonly Index n_steps, n_evaluations, n_pairs
 
     def __cinit__(self, *args, **kwargs):
+        cdef int part, level
         self.work = NULL
         self.lanes = NULL
         self.flying = NULL
         self.capacity = 0
         sources_init(&self.sources)
         self.near.atoms = self.near.cells = self.far.atoms = self.far.cells = NULL
+        for part in range(PARTS):
+            self.inside[part].atoms = self.inside[part].cells = NULL
+            self.outside[part].atoms = self.outside[part].cells = NULL
+        for level in range(LEVELS):
+            self.levels[level].rest.node = NULL
+            self.levels[level].rest.capacity = self.levels[level].rest.n = 0
+        self.everything.node = NULL
+        self.everything.capacity = 0
+        nodes_reserve(&self.everything, 1)
+        self.everything.n, self.everything.node[0] = 1, 0
 
     def __init__(self, Octree tree, *, double coulomb, double length, centre, double reach, double opening_angle,
                  double tolerance, Index max_steps):
@@ -177,9 +236,16 @@ cdef class Flights:
         self.begin(tree)
 
     def __dealloc__(self):
+        cdef int part, level
         sources_free(&self.sources)
         single_free(&self.near)
         single_free(&self.far)
+        for part in range(PARTS):
+            single_free(&self.inside[part])
+            single_free(&self.outside[part])
+        for level in range(LEVELS):
+            free(self.levels[level].rest.node)
+        free(self.everything.node)
         free(self.work)
         free(self.lanes)
         free(self.flying)
@@ -287,14 +353,24 @@ cdef class Flights:
 
     def accelerations(self, const double[:, ::1] positions):
         """Accelerations [V/nm] at n places in the present field, as of the flights of one group; shape (n, 3)."""
-        cdef Index m = positions.shape[0]
-        cdef double[:, ::1] result = np.zeros((m, 3)), at_rest = np.zeros((m, 3))
-        cdef signed char[::1] outcome = np.full(m, ION_NEVER_LEFT, np.int8)
+        cdef Index m = positions.shape[0], k
+        cdef int axis
+        cdef double[:, ::1] result = np.zeros((m, 3))
         if m:
             self.reserve(m)
+            self.alone = m == 1
+            self.arrange(m)
+            for axis in range(3):
+                for k in range(self.width):
+                    self.x[axis * self.width + k] = positions[min(k, m - 1), axis]
+                    self.v[axis * self.width + k] = self.a[axis * self.width + k] = 0.0
             self.kept[3] = -1.0
-            self.gather(m, &positions[0, 0], &at_rest[0, 0], &at_rest[0, 0], &outcome[0], 0.0)
-            self.evaluate(m, &positions[0, 0], &result[0, 0], &outcome[0], 0)
+            self.n_levels = 0
+            self.gather(0.0)
+            self.evaluate(self.x, self.a, 0)
+            for axis in range(3):
+                for k in range(m):
+                    result[k, axis] = self.a[axis * self.width + k]
         return np.asarray(result)
 
     cdef bint stays_outside(self, const Index[::1] families, const double* end, const signed char* outcome,
@@ -351,60 +427,72 @@ cdef class Flights:
         cdef double* v
         cdef double* trial
         cdef double* sums
+        cdef double* origin
         cdef double time = 0.0, dt, largest, s, length, away
-        cdef Index i, j, flying = m, steps, refused = 0
+        cdef Index i, k, n, flying = m, _, refused = 0
         cdef int stage, axis
         self.reserve(m)
-        a, x = self.work, self.work + STAGES * 3 * m
-        v, trial, sums = x + 3 * m, x + 6 * m, x + 9 * m
-        for j in range(3 * m):
-            x[j], v[j], a[j] = positions[j], velocities[j], 0.0
+        self.alone = m == 1
         for i in range(m):
             outcome[i] = ION_NEVER_LEFT
+            self.flying[i] = i
+        self.arrange(m)
+        n = 3 * self.width
+        a, x, v, trial, sums, origin = self.a, self.x, self.v, self.trial, self.sums, self.origin
+        for axis in range(3):
+            for k in range(self.width):
+                i = 3 * min(k, m - 1) + axis
+                x[axis * self.width + k] = origin[axis * self.width + k] = positions[i]
+                v[axis * self.width + k], a[axis * self.width + k] = velocities[i], 0.0
         self.kept[3] = -1.0
-        self.gather(m, x, v, a, outcome, 0.0)
-        self.evaluate(m, x, a, outcome, 0)
+        self.n_levels = 0
+        self.gather(0.0)
+        self.evaluate(x, a, 0)
         # a first step of an atomic distance at most, from the acceleration at the start
         dt = 1e30
-        for i in range(m):
-            s = sqrt(a[3 * i] ** 2 + a[3 * i + 1] ** 2 + a[3 * i + 2] ** 2)
-            length = sqrt(v[3 * i] ** 2 + v[3 * i + 1] ** 2 + v[3 * i + 2] ** 2)
-            dt = min(dt, 2.0 * self.length / (length + sqrt(2.0 * self.length * s) + 1e-30))
-        for steps in range(self.max_steps):
+        for k in range(m):
+            s = length = 0.0
+            for axis in range(3):
+                s += a[axis * self.width + k] ** 2
+                length += v[axis * self.width + k] ** 2
+            dt = min(dt, 2.0 * self.length / (sqrt(length) + sqrt(2.0 * self.length * sqrt(s)) + 1e-30))
+        for _ in range(self.max_steps):
             # stages of the step: positions x + dt (c_i v + dt sum_k a_ik f_k), and the accelerations f_i there
-            dt = min(dt, self.time_to_reach(m, x, v, outcome))
-            self.gather(m, x, v, a, outcome, dt)
+            dt = min(dt, self.time_to_reach())
+            self.gather(dt)
             for stage in range(1, STAGES):   # the last stage of a step is the first of the next one
-                weighted_sum(3 * m, stage, &STAGE[9 * stage], a, 3 * m, sums)
-                for j in range(3 * m):
-                    trial[j] = x[j] + dt * (NODE[stage] * v[j] + dt * sums[j])
-                self.evaluate(m, trial, a + 3 * m * stage, outcome, stage)
+                weighted_sum(n, stage, &STAGE[9 * stage], a, n, sums)
+                stage_places(n, dt, NODE[stage], x, v, sums, trial)
+                self.evaluate(trial, a + n * stage, stage)
             # accept the step if the largest error is below the tolerance: v += dt sum_k b_k f_k
-            largest = self.step_error(m, dt, a, v, positions, trial, sums, outcome)
+            largest = self.step_error(dt)
             self.n_steps += 1
             if largest <= 1.0:
                 refused = 0
                 time += dt
-                weighted_sum(3 * m, STAGES, VELOCITY, a, 3 * m, sums)
-                for i in range(m):
-                    if outcome[i] != ION_NEVER_LEFT:
-                        continue
+                weighted_sum(n, STAGES, VELOCITY, a, n, sums)
+                memcpy(x, trial, n * sizeof(double))
+                stage_places(n, dt, 1.0, v, sums, self.none, trial)
+                memcpy(v, trial, n * sizeof(double))
+                memcpy(a, a + n * (STAGES - 1), n * sizeof(double))
+                # flights that end
+                flying = 0
+                for k in range(self.n_flying):
+                    i = self.flying[k]
                     away = 0.0
                     for axis in range(3):
-                        x[3 * i + axis] = trial[3 * i + axis]
-                        v[3 * i + axis] += dt * sums[3 * i + axis]
-                        away += (x[3 * i + axis] - self.centre[axis]) ** 2
-                        a[3 * i + axis] = a[3 * (8 * m + i) + axis]
+                        away += (x[axis * self.width + k] - self.centre[axis]) ** 2
                     if away > self.reach * self.reach:
                         outcome[i] = ION_LEFT
-                        flying -= 1
-                    if outcome[i] == ION_LEFT or steps == self.max_steps - 1:
-                        for axis in range(3):
-                            end[7 * i + axis] = x[3 * i + axis]
-                            end[7 * i + 3 + axis] = v[3 * i + axis]
-                        end[7 * i + 6] = time
+                        self.finish(k, time, end + 7 * i)
+                    else:
+                        flying += 1
                 if flying == 0:
                     return 0
+                if flying < self.n_flying:
+                    self.leave_out(outcome)
+                    n = 3 * self.width
+                    a, x, v, trial, sums = self.a, self.x, self.v, self.trial, self.sums
             # next step: the error of a step of the embedded pair increases with dt^7
             if not largest < 1e30:   # a stage hit an atom
                 dt *= 0.1
@@ -414,104 +502,137 @@ cdef class Flights:
             else:
                 dt *= min(4.0, max(0.2, 0.9 * inverse_seventh_root(max(largest, 1e-12))))
         # flights that never left: where they are after the last step
-        for i in range(m):
+        for k in range(self.n_flying):
+            self.finish(k, time, end + 7 * self.flying[k])
+        return 0
+
+    cdef void finish(self, Index k, double time, double* end) noexcept nogil:
+        cdef int axis
+        for axis in range(3):
+            end[axis], end[3 + axis] = self.x[axis * self.width + k], self.v[axis * self.width + k]
+        end[6] = time
+
+    cdef void arrange(self, Index m) noexcept nogil:
+        # Rows for m flights; in vector lanes, copies of the last flight fill them.
+        self.n_flying = m
+        self.in_lanes = m >= self.fewest and self.opening_angle > 0.0
+        self.width = (m + SINGLE_LANES - 1) // SINGLE_LANES * SINGLE_LANES if self.in_lanes else m
+        self.a = self.work
+        self.x = self.a + STAGES * 3 * self.width
+        self.v = self.x + 3 * self.width
+        self.trial = self.v + 3 * self.width
+        self.sums = self.trial + 3 * self.width
+        self.origin = self.sums + 3 * self.width
+        self.ratios = self.origin + 3 * self.width
+
+    cdef void leave_out(self, const signed char* outcome) noexcept nogil:
+        # Removes the flights that have ended from the rows.
+        cdef Index k, at, m = 0, width = self.width, i
+        cdef int axis
+        cdef double* x = self.x
+        cdef double* v = self.v
+        cdef double* origin = self.origin
+        cdef double* spare = self.spare
+        for k in range(self.n_flying):
+            i = self.flying[k]
             if outcome[i] == ION_NEVER_LEFT:
                 for axis in range(3):
-                    end[7 * i + axis] = x[3 * i + axis]
-                    end[7 * i + 3 + axis] = v[3 * i + axis]
-                end[7 * i + 6] = time
-        return 0
+                    at = axis * width + k
+                    spare[12 * m + axis], spare[12 * m + 3 + axis] = x[at], v[at]
+                    spare[12 * m + 6 + axis], spare[12 * m + 9 + axis] = self.a[at], origin[at]
+                self.flying[m] = i
+                m += 1
+        self.arrange(m)
+        for k in range(self.width):
+            i = min(k, m - 1)
+            for axis in range(3):
+                at = axis * self.width + k
+                self.x[at], self.v[at] = spare[12 * i + axis], spare[12 * i + 3 + axis]
+                self.a[at], self.origin[at] = spare[12 * i + 6 + axis], spare[12 * i + 9 + axis]
 
     cdef int reserve(self, Index m) except -1 nogil:
         # Memory for m flights.
-        if m > self.capacity:
+        cdef Index width = (m + SINGLE_LANES - 1) // SINGLE_LANES * SINGLE_LANES, k
+        if width > self.capacity:
             free(self.work)
             free(self.lanes)
             free(self.flying)
-            self.capacity = m
-            self.work = <double*>malloc((STAGES + 4) * 3 * m * sizeof(double))
-            self.lanes = <float*>malloc(6 * (m + SINGLE_LANES) * sizeof(float))
-            self.flying = <Index*>malloc(m * sizeof(Index))
+            self.capacity = width
+            self.work = <double*>malloc(((STAGES + 5) * 3 + 1 + 12 + 3) * width * sizeof(double))
+            self.lanes = <float*>malloc(6 * width * sizeof(float))
+            self.flying = <Index*>malloc(width * sizeof(Index))
             if self.work == NULL or self.lanes == NULL or self.flying == NULL:
                 with gil:
                     raise MemoryError
+            self.spare = self.work + ((STAGES + 5) * 3 + 1) * width
+            self.none = self.spare + 12 * width
+            for k in range(3 * width):
+                self.none[k] = 0.0
         return 0
 
-    cdef double time_to_reach(self, Index m, const double* x, const double* v,
-                              const signed char* outcome) noexcept nogil:
+    cdef double time_to_reach(self) noexcept nogil:
         # Time in which the slowest flight close to `reach` crosses it in a straight line, so that no flight ends far
         # beyond; flights that need more than the largest step are ignored.
-        cdef double rr, rv, vv, dx, longest = 0.0
-        cdef Index i
+        cdef double rr, rv, vv, dx, speed, longest = 0.0
+        cdef Index k
         cdef int axis
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                rr = rv = vv = 0.0
-                for axis in range(3):
-                    dx = x[3 * i + axis] - self.centre[axis]
-                    rr += dx * dx
-                    rv += dx * v[3 * i + axis]
-                    vv += v[3 * i + axis] ** 2
-                if vv == 0.0:
-                    return INFINITY
-                longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
+        for k in range(self.n_flying):
+            rr = rv = vv = 0.0
+            for axis in range(3):
+                dx, speed = self.x[axis * self.width + k] - self.centre[axis], self.v[axis * self.width + k]
+                rr += dx * dx
+                rv += dx * speed
+                vv += speed ** 2
+            if vv == 0.0:
+                return INFINITY
+            longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
         return 1.0001 * longest
 
-    cdef double step_error(self, Index m, double dt, const double* a, const double* v, const double* origin,
-                           const double* trial, double* sums, const signed char* outcome) noexcept nogil:
+    cdef double step_error(self, double dt) noexcept nogil:
         # Largest error of the step of all flights, relative to the tolerance.
-        cdef double s, path, speed, largest = 0.0
-        cdef Index i
-        cdef int axis
-        weighted_sum(3 * m, STAGES, POSITION_ERROR, a, 3 * m, sums)
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                s = path = 0.0
-                for axis in range(3):
-                    s += sums[3 * i + axis] ** 2
-                    path += (trial[3 * i + axis] - origin[3 * i + axis]) ** 2
-                s = dt * dt * sqrt(s) / (self.tolerance * (sqrt(path) + 0.1 * self.length))
-                largest = max(largest, s) if s == s else INFINITY
-        weighted_sum(3 * m, STAGES, VELOCITY_ERROR, a, 3 * m, sums)
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                s = speed = 0.0
-                for axis in range(3):
-                    s += sums[3 * i + axis] ** 2
-                    # the acceleration at the end of the step is that of the last stage
-                    speed += (v[3 * i + axis] + 0.5 * dt * (a[3 * i + axis] + a[3 * (8 * m + i) + axis])) ** 2
-                s = dt * sqrt(s) / (self.tolerance * sqrt(speed))
-                largest = max(largest, s) if s == s else INFINITY
+        cdef Index n = 3 * self.width
+        cdef double largest
+        cdef double* speeds = self.spare + n
+        weighted_sum(n, STAGES, POSITION_ERROR, self.a, n, self.sums)
+        relative_lengths(self.width, dt * dt / self.tolerance, 0.1 * self.length, self.sums, self.trial, self.origin,
+                         self.ratios)
+        largest = self.largest_ratio(0.0)
+        # the acceleration at the end of the step is that of the last stage
+        weighted_sum(n, STAGES, VELOCITY_ERROR, self.a, n, self.sums)
+        weighted_sum(n, STAGES, ENDS, self.a, n, self.spare)
+        stage_places(n, 0.5 * dt, 1.0, self.v, self.spare, self.none, speeds)
+        relative_lengths(self.width, dt / self.tolerance, 0.0, self.sums, speeds, self.none, self.ratios)
+        return self.largest_ratio(largest)
+
+    cdef double largest_ratio(self, double largest) noexcept nogil:
+        cdef Index k
+        cdef double s
+        for k in range(self.n_flying):
+            s = self.ratios[k]
+            largest = max(largest, s) if s == s else INFINITY
         return largest
 
-    cdef int gather(self, Index m, const double* x, const double* v, const double* a, const signed char* outcome,
-                    double dt) except -1 nogil:
+    cdef int gather(self, double dt) except -1 nogil:
         # Collects the sources for a ball that contains all flights until the end of the step.
         cdef double[4] whole
         cdef double[4 * PARTS] balls
-        cdef double[3] point
-        cdef double[3 * SAMPLES] samples
-        cdef double largest = 0.0
-        cdef Index i, n = 0
+        cdef double angle, largest = 0.0
+        cdef const Nodes* roots
         cdef int part, axis
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                self.flying[n] = i
-                n += 1
-        self.enclose(n, x, v, a, 0.0, dt, whole)
+        enclosing_ball(self.width, self.x, self.v, self.a, 0.0, dt, whole)
         if self.opening_angle == 0.0:
             self.tree.collect(whole[0], whole[1], whole[2], whole[3], self.opening_angle, &self.sources)
             return 0
-        self.n_parts = 0
-        self.in_lanes = n >= self.fewest
-        if m == 1:
-            if self.is_kept(whole):
+        if self.alone:
+            if is_inside(whole, self.kept):
                 return 0
-            self.keep_ahead(x, v, a, dt, whole)
+            self.keep_ahead(dt, whole)
+        self.n_parts = 0
+        roots = &self.everything
         if self.in_lanes and whole[3] > 1e-3 * self.length:
             self.n_parts = PARTS
             for part in range(PARTS):
-                self.enclose(n, x, v, a, BEGIN[part] * dt, END[part] * dt, balls + 4 * part)
+                enclosing_ball(self.width, self.x, self.v, self.a, BEGIN[part] * dt, END[part] * dt, balls + 4 * part)
                 largest = max(largest, balls[4 * part + 3])
             if dt == 0.0 or largest > SPLIT * whole[3]:   # they would overlap
                 self.n_parts = 1
@@ -523,30 +644,86 @@ cdef class Flights:
                     self.expansions[part].centre[axis] = balls[4 * part + axis]
                     balls[4 * part + axis] -= whole[axis]
                 balls[4 * part + 3] *= FAR
-        self.tree.collect_single(whole, whole[3], self.opening_angle * (LONE if m == 1 else 1.0), self.n_parts, balls,
-                                 &self.sources, &self.near, &self.far)
+            self.nest(whole, dt)
+            if self.n_levels:
+                roots = &self.levels[self.n_levels - 1].rest
+        angle = self.opening_angle * (LONE if self.alone else 1.0)
+        self.tree.walk_from(roots.n, roots.node, whole[0], whole[1], whole[2], whole[3], angle, &self.sources)
+        self.tree.copy_single(whole, self.n_parts, balls, &self.sources, &self.near, &self.far)
+        if self.n_parts and self.n_levels == 0 and self.far.n_atoms + self.far.n_cells <= FEW:
+            self.tree.copy_single(whole, 0, NULL, &self.sources, &self.near, &self.far)
+            self.n_parts = 0
         if not self.in_lanes:
             single_pad(&self.near)
-        if self.n_parts:
-            single_pad(&self.far)
         for part in range(self.n_parts):
-            for i in range(SAMPLES):
-                self.far_field.point(&self.expansions[part], i, point)
-                single_field(&self.far, point[0], point[1], point[2], samples + 3 * i)
-            self.far_field.expand(&self.expansions[part], samples)
-            self.n_pairs += SAMPLES * (self.far.n_atoms + self.far.n_cells)
+            if self.n_parts > 1:
+                single_part(&self.near, balls + 4 * part, &self.inside[part], &self.outside[part])
+            self.expand(&self.expansions[part], self.n_levels, &self.far,
+                        &self.outside[part] if self.n_parts > 1 else NULL)
         return 0
 
-    cdef bint is_kept(self, const double* ball) noexcept nogil:
-        # Whether a ball lies in that for which the sources were collected.
-        cdef double s = 0.0, space = self.kept[3] - ball[3]
+    cdef int nest(self, const double* whole, double dt) except -1 nogil:
+        # Levels whose balls contain the ball of the step: two at the start, later one for a step outside all of them.
+        cdef int number
+        while self.n_levels and not is_inside(whole, self.levels[self.n_levels - 1].ball):
+            self.n_levels -= 1
+        if dt == 0.0:
+            for number in range(LEVELS):
+                self.add_level(whole, AROUND[number] * self.length)
+        elif self.n_levels == 0 and whole[3] < LARGEST * self.length:
+            self.add_level(whole, whole[3])
+        return 0
+
+    cdef int add_level(self, const double* centre, double radius) except -1 nogil:
+        # A level inside of the present ones.
+        cdef Level* level = &self.levels[self.n_levels]
+        cdef const Nodes* roots = &self.levels[self.n_levels - 1].rest if self.n_levels else &self.everything
         cdef int axis
         for axis in range(3):
-            s += (ball[axis] - self.kept[axis]) ** 2
-        return space >= 0.0 and s <= space * space
+            level.ball[axis] = level.expansion.centre[axis] = centre[axis]
+        level.ball[3] = level.expansion.radius = 1.05 * radius   # a stage may lie a little outside
+        self.tree.part(roots, level.ball, self.opening_angle, FAR * level.ball[3], &self.sources, &level.rest)
+        self.tree.copy_single(level.ball, 0, NULL, &self.sources, &self.far, &self.near)
+        self.expand(&level.expansion, self.n_levels, &self.far, NULL)
+        self.n_levels += 1
+        return 0
 
-    cdef void keep_ahead(self, const double* x, const double* v, const double* a, double dt,
-                         double* ball) noexcept nogil:
+    cdef int expand(self, Expansion* expansion, int n_levels, SingleSources* first, SingleSources* second
+                    ) except -1 nogil:
+        # Expands the field of sources, and of those beyond some levels.
+        cdef double[3 * SAMPLES] samples
+        cdef double[3] point, field
+        cdef float[3 * PADDED] targets, above
+        cdef int i, axis
+        single_pad(first)
+        if second != NULL:
+            single_pad(second)
+        for i in range(SAMPLES):
+            self.far_field.point(expansion, i, point)
+            single_field(first, point[0], point[1], point[2], samples + 3 * i)
+            if second != NULL:
+                single_field(second, point[0], point[1], point[2], field)
+                for axis in range(3):
+                    samples[3 * i + axis] += field[axis]
+            for axis in range(3):
+                targets[axis * PADDED + i] = <float>(point[axis] - expansion.centre[axis])
+        self.n_pairs += SAMPLES * (first.n_atoms + first.n_cells)
+        if second != NULL:
+            self.n_pairs += SAMPLES * (second.n_atoms + second.n_cells)
+        if n_levels:
+            for i in range(3 * PADDED):
+                above[i] = 0.0
+            for axis in range(3):
+                for i in range(SAMPLES, PADDED):
+                    targets[axis * PADDED + i] = 0.0
+            add_expanded(&self.levels[n_levels - 1].expansion, expansion.centre, PADDED, targets, above)
+            for axis in range(3):
+                for i in range(SAMPLES):
+                    samples[3 * i + axis] += above[axis * PADDED + i]
+        self.far_field.expand(expansion, samples)
+        return 0
+
+    cdef void keep_ahead(self, double dt, double* ball) noexcept nogil:
         # Widens the ball of a step of a flight alone to the way that follows: straight on from the end of the step.
         cdef double[3] centre
         cdef double s = 0.0, apart = 0.0, way
@@ -555,8 +732,8 @@ cdef class Flights:
             ball[3] = AT_START * self.length
         else:
             for axis in range(3):
-                way = AHEAD * dt * v[axis] + (AHEAD - 0.5) * dt * dt * a[axis]
-                centre[axis] = x[axis] + 0.5 * way
+                way = AHEAD * dt * self.v[axis] + (AHEAD - 0.5) * dt * dt * self.a[axis]
+                centre[axis] = self.x[axis] + 0.5 * way
                 s += way * way
                 apart += (centre[axis] - ball[axis]) ** 2
                 ball[axis] = centre[axis]
@@ -564,66 +741,31 @@ cdef class Flights:
         for axis in range(4):
             self.kept[axis] = ball[axis]
 
-    cdef void enclose(self, Index n, const double* x, const double* v, const double* a, double begin, double end,
-                      double* ball) noexcept nogil:
-        # Centre and radius of a ball around all flights at two times of the step, and between.
-        cdef double s, first, last
-        cdef Index k, i
-        cdef int axis
-        ball[0] = ball[1] = ball[2] = ball[3] = 0.0
-        for k in range(n):
-            i = 3 * self.flying[k]
-            for axis in range(3):
-                ball[axis] += (x[i + axis] + 0.5 * (begin + end) * v[i + axis]
-                               + 0.25 * (begin * begin + end * end) * a[i + axis])
-        for axis in range(3):
-            ball[axis] /= n
-        for k in range(n):
-            i = 3 * self.flying[k]
-            first = last = 0.0
-            for axis in range(3):
-                s = x[i + axis] - ball[axis]
-                first += (s + begin * (v[i + axis] + 0.5 * begin * a[i + axis])) ** 2
-                last += (s + end * (v[i + axis] + 0.5 * end * a[i + axis])) ** 2
-            ball[3] = max(ball[3], first, last)
-        ball[3] = sqrt(ball[3])
-
-    cdef void evaluate(self, Index m, const double* x, double* a, const signed char* outcome, int stage) noexcept nogil:
-        # Accelerations [V/nm] of the unfinished flights at the places of a stage.
-        cdef Index i, k, n = 0, width
-        cdef int axis
-        cdef float* field
-        for i in range(m):
-            if outcome[i] == ION_NEVER_LEFT:
-                self.flying[n] = i
-                n += 1
-        if self.opening_angle == 0.0:
-            for k in range(n):
-                i = 3 * self.flying[k]
-                sources_field(&self.sources, x[i], x[i + 1], x[i + 2], a + i)
-            self.n_pairs += n * (self.sources.n_atoms + self.sources.n_cells)
-        elif not self.in_lanes:
-            for k in range(n):
-                i = 3 * self.flying[k]
-                single_field(&self.near, x[i], x[i + 1], x[i + 2], a + i)
-            self.n_pairs += n * (self.near.n_atoms + self.near.n_cells)
-        else:
-            width = (n + SINGLE_LANES - 1) // SINGLE_LANES * SINGLE_LANES
-            field = self.lanes + 3 * width
-            for axis in range(3):
-                for k in range(width):   # the last flight fills the lanes
-                    i = 3 * self.flying[min(k, n - 1)]
-                    self.lanes[axis * width + k] = <float>(x[i + axis] - self.near.origin[axis])
-                    field[axis * width + k] = 0.0
-            bundle_atoms(self.near.n_atoms, self.near.capacity, self.near.atoms, width, self.lanes, field)
-            bundle_cells(self.near.n_cells, self.near.capacity, self.near.cells, width, self.lanes, field)
-            for axis in range(3):
-                for k in range(n):
-                    a[3 * self.flying[k] + axis] = field[axis * width + k]
-            self.n_pairs += n * (self.near.n_atoms + self.near.n_cells)
+    cdef void evaluate(self, const double* x, double* a, int stage) noexcept nogil:
+        # Accelerations [V/nm] of the flights at the places of a stage.
+        cdef Index j, k, width = self.width
+        cdef int axis, part = PART[stage] if self.n_parts > 1 else 0
+        cdef float* field = self.lanes + 3 * width
+        cdef double[3] one
+        cdef SingleSources* near = &self.inside[part] if self.n_parts > 1 else &self.near
+        self.n_evaluations += self.n_flying
+        if self.in_lanes:
+            into_lanes(width, x, near.origin, self.lanes)
+            for j in range(3 * width):
+                field[j] = 0.0
+            bundle_atoms(near.n_atoms, near.capacity, near.atoms, width, self.lanes, field)
+            bundle_cells(near.n_cells, near.capacity, near.cells, width, self.lanes, field)
             if self.n_parts:
-                add_expanded(&self.expansions[PART[stage] if self.n_parts > 1 else 0], n, x, self.flying, a)
-        for k in range(n):
+                add_expanded(&self.expansions[part], near.origin, width, self.lanes, field)
+            out_of_lanes(3 * width, self.coulomb, field, a)
+            self.n_pairs += self.n_flying * (near.n_atoms + near.n_cells)
+            return
+        for k in range(width):
+            if self.opening_angle == 0.0:
+                sources_field(&self.sources, x[k], x[width + k], x[2 * width + k], one)
+                self.n_pairs += self.sources.n_atoms + self.sources.n_cells
+            else:
+                single_field(near, x[k], x[width + k], x[2 * width + k], one)
+                self.n_pairs += near.n_atoms + near.n_cells
             for axis in range(3):
-                a[3 * self.flying[k] + axis] *= self.coulomb
-        self.n_evaluations += n
+                a[axis * width + k] = self.coulomb * one[axis]

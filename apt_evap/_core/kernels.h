@@ -66,42 +66,59 @@
 
 #include "kernels_bundle.h"
 
-/* Values of three polynomials of the same degree at 16 points: coefficients of all x^i y^j z^k with i + j + k <= degree
- * (k fastest), for each component in turn. */
-#define MAX_POWERS 8
-APT_CLONES static void polynomial_field(int degree, const float *restrict coefficients, const float *restrict x,
-                                        const float *restrict y, const float *restrict z, float *restrict ex,
-                                        float *restrict ey, float *restrict ez)
+/* Adds three polynomials at m places, a multiple of SINGLE_LANES: targets and field contain x[m], y[m], z[m]. With
+ * u = scale (x - centre), the polynomials are sums of coefficients of all u^i v^j w^k with i + j + k <= degree (k fastest),
+ * for each component in turn. Horner's scheme in each variable. */
+APT_CLONES static void add_polynomials(int degree, const float *restrict coefficients, const float *restrict centre,
+                                       float scale, Index m, const float *restrict targets, float *restrict field)
 {
-    float px[MAX_POWERS][SINGLE_LANES], py[MAX_POWERS][SINGLE_LANES], pz[MAX_POWERS][SINGLE_LANES];
-    float fx[SINGLE_LANES] = {0}, fy[SINGLE_LANES] = {0}, fz[SINGLE_LANES] = {0};
     const Index stride = (Index)(degree + 1) * (degree + 2) * (degree + 3) / 6;
-    Index at = 0;
-    for (int l = 0; l < SINGLE_LANES; l++)
-        px[0][l] = py[0][l] = pz[0][l] = 1.0f;
-    for (int d = 1; d <= degree; d++) {
+    for (Index first = 0; first < m; first += SINGLE_LANES) {
+        float x[SINGLE_LANES], y[SINGLE_LANES], z[SINGLE_LANES];
+        float fx[SINGLE_LANES] = {0}, fy[SINGLE_LANES] = {0}, fz[SINGLE_LANES] = {0};
 #pragma omp simd
         for (int l = 0; l < SINGLE_LANES; l++) {
-            px[d][l] = px[d - 1][l] * x[l];
-            py[d][l] = py[d - 1][l] * y[l];
-            pz[d][l] = pz[d - 1][l] * z[l];
+            x[l] = scale * (targets[first + l] - centre[0]);
+            y[l] = scale * (targets[m + first + l] - centre[1]);
+            z[l] = scale * (targets[2 * m + first + l] - centre[2]);
         }
-    }
-    for (int i = 0; i <= degree; i++)
-        for (int j = 0; i + j <= degree; j++)
-            for (int k = 0; i + j + k <= degree; k++, at++) {
-                const float cx = coefficients[at], cy = coefficients[stride + at], cz = coefficients[2 * stride + at];
+        Index at = stride;
+        for (int i = degree; i >= 0; i--) {
+            float gx[SINGLE_LANES] = {0}, gy[SINGLE_LANES] = {0}, gz[SINGLE_LANES] = {0};
+            for (int j = degree - i; j >= 0; j--) {
+                float hx[SINGLE_LANES] = {0}, hy[SINGLE_LANES] = {0}, hz[SINGLE_LANES] = {0};
+                for (int k = degree - i - j; k >= 0; k--) {
+                    at--;
+                    const float cx = coefficients[at], cy = coefficients[stride + at];
+                    const float cz = coefficients[2 * stride + at];
+#pragma omp simd
+                    for (int l = 0; l < SINGLE_LANES; l++) {
+                        hx[l] = hx[l] * z[l] + cx;
+                        hy[l] = hy[l] * z[l] + cy;
+                        hz[l] = hz[l] * z[l] + cz;
+                    }
+                }
 #pragma omp simd
                 for (int l = 0; l < SINGLE_LANES; l++) {
-                    const float m = px[i][l] * py[j][l] * pz[k][l];
-                    fx[l] += cx * m;
-                    fy[l] += cy * m;
-                    fz[l] += cz * m;
+                    gx[l] = gx[l] * y[l] + hx[l];
+                    gy[l] = gy[l] * y[l] + hy[l];
+                    gz[l] = gz[l] * y[l] + hz[l];
                 }
             }
-    memcpy(ex, fx, sizeof fx);
-    memcpy(ey, fy, sizeof fy);
-    memcpy(ez, fz, sizeof fz);
+#pragma omp simd
+            for (int l = 0; l < SINGLE_LANES; l++) {
+                fx[l] = fx[l] * x[l] + gx[l];
+                fy[l] = fy[l] * x[l] + gy[l];
+                fz[l] = fz[l] * x[l] + gz[l];
+            }
+        }
+#pragma omp simd
+        for (int l = 0; l < SINGLE_LANES; l++) {
+            field[first + l] += fx[l];
+            field[m + first + l] += fy[l];
+            field[2 * m + first + l] += fz[l];
+        }
+    }
 }
 
 /* The sums of a patch of about 300 atoms are in single precision, with coordinates relative to the hole. The length of

@@ -75,17 +75,119 @@ APT_CLONES static void bundle_cells(Index n, Index stride, const float *restrict
     }
 }
 
-/* sums[j] = sum over k of weights[k] rows[k * stride + j], for n numbers j. */
+/* sums[j] = sum over k of weights[k] rows[k * stride + j], for n numbers j; blocks of sums stay in registers. */
+#define BLOCK 32
 APT_CLONES static void weighted_sum(Index n, int n_rows, const double *restrict weights, const double *restrict rows,
                                     Index stride, double *restrict sums)
 {
-    for (Index j = 0; j < n; j++)
-        sums[j] = 0.0;
-    for (int k = 0; k < n_rows; k++) {
-        const double *row = rows + k * stride;
-        const double weight = weights[k];
+    Index first = 0;
+    for (; first + BLOCK <= n; first += BLOCK) {
+        double sum[BLOCK] = {0};
+        for (int k = 0; k < n_rows; k++) {
+            const double *restrict row = rows + k * stride + first;
+            const double weight = weights[k];
 #pragma omp simd
-        for (Index j = 0; j < n; j++)
-            sums[j] += weight * row[j];
+            for (int j = 0; j < BLOCK; j++)
+                sum[j] += weight * row[j];
+        }
+        memcpy(sums + first, sum, sizeof sum);
+    }
+    for (; first < n; first++) {
+        double sum = 0.0;
+        for (int k = 0; k < n_rows; k++)
+            sum += weights[k] * rows[k * stride + first];
+        sums[first] = sum;
+    }
+}
+
+/* The steps of a bundle: rows x, y and z of `width` numbers each, in double precision. */
+
+/* Places of a stage: x + dt (node v + dt sums), for n numbers. */
+APT_CLONES static void stage_places(Index n, double dt, double node, const double *restrict x,
+                                    const double *restrict v, const double *restrict sums, double *restrict places)
+{
+#pragma omp simd
+    for (Index j = 0; j < n; j++)
+        places[j] = x[j] + dt * (node * v[j] + dt * sums[j]);
+}
+
+/* Single precision, relative to the origin. */
+APT_CLONES static void into_lanes(Index width, const double *restrict x, const double *restrict origin,
+                                  float *restrict lanes)
+{
+    for (int axis = 0; axis < 3; axis++) {
+        const double shift = origin[axis];
+#pragma omp simd
+        for (Index k = 0; k < width; k++)
+            lanes[axis * width + k] = (float)(x[axis * width + k] - shift);
+    }
+}
+
+APT_CLONES static void out_of_lanes(Index n, double factor, const float *restrict lanes, double *restrict values)
+{
+#pragma omp simd
+    for (Index k = 0; k < n; k++)
+        values[k] = factor * lanes[k];
+}
+
+/* Centre and radius of a ball around all flights at two times of the step. */
+APT_CLONES static void enclosing_ball(Index width, const double *restrict x, const double *restrict v,
+                                      const double *restrict a, double begin, double end, double *restrict ball)
+{
+    const double mean = 0.5 * (begin + end), half = 0.25 * (begin * begin + end * end);
+    const double begin2 = 0.5 * begin * begin, end2 = 0.5 * end * end;
+    double largest[LANES] = {0};
+    for (int axis = 0; axis < 3; axis++) {
+        const double *restrict xs = x + axis * width, *restrict vs = v + axis * width, *restrict as = a + axis * width;
+        double sum[LANES] = {0}, total = 0.0;
+        for (Index k = 0; k + LANES <= width; k += LANES) {
+#pragma omp simd
+            for (int l = 0; l < LANES; l++)
+                sum[l] += xs[k + l] + mean * vs[k + l] + half * as[k + l];
+        }
+        for (Index k = width - width % LANES; k < width; k++)
+            sum[k % LANES] += xs[k] + mean * vs[k] + half * as[k];
+        for (int l = 0; l < LANES; l++)
+            total += sum[l];
+        ball[axis] = total / width;
+    }
+    for (Index k = 0; k < width; k += LANES) {
+        const Index m = width - k < LANES ? width - k : LANES;
+        double first[LANES] = {0}, last[LANES] = {0};
+        for (int axis = 0; axis < 3; axis++) {
+            const double *restrict xs = x + axis * width + k, *restrict vs = v + axis * width + k;
+            const double *restrict as = a + axis * width + k;
+            const double centre = ball[axis];
+#pragma omp simd
+            for (int l = 0; l < m; l++) {
+                const double s = xs[l] - centre;
+                const double f = s + begin * vs[l] + begin2 * as[l], g = s + end * vs[l] + end2 * as[l];
+                first[l] += f * f;
+                last[l] += g * g;
+            }
+        }
+        for (int l = 0; l < LANES; l++) {
+            const double s = first[l] > last[l] ? first[l] : last[l];
+            largest[l] = s > largest[l] ? s : largest[l];
+        }
+    }
+    ball[3] = 0.0;
+    for (int l = 0; l < LANES; l++)
+        ball[3] = largest[l] > ball[3] ? largest[l] : ball[3];
+    ball[3] = sqrt(ball[3]);
+}
+
+/* For each flight scale |sums| / (|p - q| + more). */
+APT_CLONES static void relative_lengths(Index width, double scale, double more, const double *restrict sums,
+                                        const double *restrict p, const double *restrict q, double *restrict result)
+{
+    const double *restrict sy = sums + width, *restrict sz = sums + 2 * width;
+    const double *restrict py = p + width, *restrict pz = p + 2 * width;
+    const double *restrict qy = q + width, *restrict qz = q + 2 * width;
+#pragma omp simd
+    for (Index k = 0; k < width; k++) {
+        const double s = sums[k] * sums[k] + sy[k] * sy[k] + sz[k] * sz[k];
+        const double x = p[k] - q[k], y = py[k] - qy[k], z = pz[k] - qz[k];
+        result[k] = scale * sqrt(s) / (sqrt(x * x + y * y + z * z) + more);
     }
 }

@@ -1,7 +1,7 @@
 """The octree's memory, for the other compiled modules."""
 
 from apt_evap._core.index cimport Index
-from apt_evap._core.sources cimport SingleSources, Sources
+from apt_evap._core.sources cimport Nodes, SingleSources, Sources
 
 
 cdef class Octree:
@@ -35,10 +35,13 @@ cdef class Octree:
                   Sources* sources) except -1 nogil
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
                      Sources* sources) except -1 nogil
-    cdef int collect_single(self, const double* centre, double radius, double opening_angle, int n_balls,
-                            const double* balls, Sources* sources, SingleSources* near, SingleSources* far
-                            ) except -1 nogil
+    cdef int copy_single(self, const double* centre, int n_balls, const double* balls, const Sources* sources,
+                         SingleSources* near, SingleSources* far) except -1 nogil
     cdef Index within(self, double px, double py, double pz, double radius, int* slots, Index most) noexcept nogil
     cdef void mark(self, Index node) noexcept nogil
     cdef int field_at(self, double px, double py, double pz, double opening_angle, double* field) except -1 nogil
     cdef double potential_at(self, double px, double py, double pz, double opening_angle) except? -1 nogil
+    cdef int walk_from(self, Index n_roots, const int* roots, double cx, double cy, double cz, double radius,
+                       double opening_angle, Sources* sources) except -1 nogil
+    cdef int part(self, const Nodes* roots, const double* ball, double opening_angle, double beyond, Sources* sources,
+                  Nodes* rest) except -1 nogil

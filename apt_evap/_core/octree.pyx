@@ -10,16 +10,28 @@ cell does not replace its atoms: its smaller cells or its atoms act one by one.
 
 from cython.parallel cimport prange
 from libc.math cimport sqrt
+from libc.stdlib cimport free
 
 from apt_evap._core.index cimport Index
 from apt_evap._core.sources cimport (
-    CELL, LANES, SingleSources, Sources, single_reserve, sources_field, sources_free, sources_grow,
-    sources_init, sources_potential,
+    CELL, LANES, Nodes, SingleSources, Sources, nodes_reserve, single_reserve, sources_field, sources_free,
+    sources_grow, sources_init, sources_potential,
 )
 
 import numpy as np
 
 import apt_evap._core.morton as morton
+
+
+cdef extern from *:
+    """
+    #ifdef __GNUC__
+    #define APT_PREFETCH(place) do { __builtin_prefetch(place); __builtin_prefetch((place) + 8); } while (0)
+    #else
+    #define APT_PREFETCH(place) (void)(place)
+    #endif
+    """
+    void prefetch "APT_PREFETCH"(const double*) noexcept nogil
 
 
 cdef inline bint is_within(double x, double y, double z, int n_balls, const double* balls) noexcept nogil:
@@ -280,30 +292,88 @@ cdef class Octree:
                   Sources* sources) except -1 nogil:
         # Lists the sources for the targets in a ball: a cell if its ball appears under less than the opening angle from
         # every point of the ball of the targets, otherwise its atoms.
-        cdef Index node = 0, k
+        cdef int root = 0
+        return self.walk_from(1, &root, cx, cy, cz, radius, opening_angle, sources)
+
+    cdef int walk_from(self, Index n_roots, const int* roots, double cx, double cy, double cz, double radius,
+                       double opening_angle, Sources* sources) except -1 nogil:
+        # The same of the subtrees of some nodes.
+        cdef Index node, k, number, end
         cdef double dx, dy, dz, apart, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
         sources.n_atoms = sources.n_cells = 0
-        while node < self.n_nodes:
-            if sources.n_cells + LANES >= sources.capacity:
-                sources_grow(sources)
-            dx, dy, dz = cx - self.ball[node, 0], cy - self.ball[node, 1], cz - self.ball[node, 2]
-            apart = self.ball[node, 3] * factor + radius
-            if apart * apart < dx * dx + dy * dy + dz * dz and not self.cancels[node]:
-                sources.cell[sources.n_cells] = <int>node
-                sources.n_cells += 1
-                node = self.skip[node]
-            elif self.skip[node] == node + 1:
-                k = self.first[node]
-                while k >= 0:
-                    if sources.n_atoms >= sources.capacity:
-                        sources_grow(sources)
-                    if self.atom[k] >= 0:
-                        sources.atom[sources.n_atoms] = <int>k
-                        sources.n_atoms += 1
-                    k = self.following(node, k)
-                node += 1
-            else:
-                node += 1
+        for number in range(n_roots):
+            node, end = roots[number], self.skip[roots[number]]
+            while node < end:
+                if sources.n_cells + LANES >= sources.capacity:
+                    sources_grow(sources)
+                dx, dy, dz = cx - self.ball[node, 0], cy - self.ball[node, 1], cz - self.ball[node, 2]
+                apart = self.ball[node, 3] * factor + radius
+                if apart * apart < dx * dx + dy * dy + dz * dz and not self.cancels[node]:
+                    sources.cell[sources.n_cells] = <int>node
+                    sources.n_cells += 1
+                    node = self.skip[node]
+                elif self.skip[node] == node + 1:
+                    k = self.first[node]
+                    while k >= 0:
+                        if sources.n_atoms >= sources.capacity:
+                            sources_grow(sources)
+                        if self.atom[k] >= 0:
+                            sources.atom[sources.n_atoms] = <int>k
+                            sources.n_atoms += 1
+                        k = self.following(node, k)
+                    node += 1
+                else:
+                    node += 1
+        return 0
+
+    cdef int part(self, const Nodes* roots, const double* ball, double opening_angle, double beyond, Sources* sources,
+                  Nodes* rest) except -1 nogil:
+        # Divides the subtrees of some nodes: sources for the targets in a ball that are farther than `beyond` from its
+        # centre, and nodes with all the others. These are as large as possible: a smaller ball needs fewer of them.
+        cdef Index node, k, number, end
+        cdef double dx, dy, dz, s, radius, apart, factor = 2.0 / opening_angle
+        sources.n_atoms = sources.n_cells = rest.n = 0
+        for number in range(roots.n):
+            node, end = roots.node[number], self.skip[roots.node[number]]
+            while node < end:
+                if sources.n_cells >= sources.capacity:
+                    sources_grow(sources)
+                if rest.n >= rest.capacity:
+                    nodes_reserve(rest, rest.n + 1)
+                dx, dy, dz = ball[0] - self.ball[node, 0], ball[1] - self.ball[node, 1], ball[2] - self.ball[node, 2]
+                s = dx * dx + dy * dy + dz * dz
+                radius = self.ball[node, 3]
+                apart = radius * factor + ball[3]
+                if radius <= beyond and s <= (beyond - radius) * (beyond - radius):
+                    rest.node[rest.n] = <int>node
+                    rest.n += 1
+                    node = self.skip[node]
+                elif apart * apart < s and not self.cancels[node]:
+                    dx, dy = ball[0] - self.cells[node, 0], ball[1] - self.cells[node, 1]
+                    dz = ball[2] - self.cells[node, 2]
+                    if dx * dx + dy * dy + dz * dz > beyond * beyond:
+                        sources.cell[sources.n_cells] = <int>node
+                        sources.n_cells += 1
+                    else:
+                        rest.node[rest.n] = <int>node
+                        rest.n += 1
+                    node = self.skip[node]
+                elif self.skip[node] == node + 1:
+                    if s > (beyond + radius) * (beyond + radius):
+                        k = self.first[node]
+                        while k >= 0:
+                            if sources.n_atoms >= sources.capacity:
+                                sources_grow(sources)
+                            if self.atom[k] >= 0:
+                                sources.atom[sources.n_atoms] = <int>k
+                                sources.n_atoms += 1
+                            k = self.following(node, k)
+                    else:
+                        rest.node[rest.n] = <int>node
+                        rest.n += 1
+                    node += 1
+                else:
+                    node += 1
         return 0
 
     cdef int collect(self, double cx, double cy, double cz, double radius, double opening_angle,
@@ -329,9 +399,8 @@ cdef class Octree:
             sources.n_cells += 1
         return 0
 
-    cdef int collect_single(self, const double* centre, double radius, double opening_angle, int n_balls,
-                            const double* balls, Sources* sources, SingleSources* near, SingleSources* far
-                            ) except -1 nogil:
+    cdef int copy_single(self, const double* centre, int n_balls, const double* balls, const Sources* sources,
+                         SingleSources* near, SingleSources* far) except -1 nogil:
         # Copies the sources of a walk in single precision, relative to the centre: those within one of n balls (n, 4),
         # relative to the centre, too, and the others. Without balls all are near. The caller pads the lists.
         cdef SingleSources* part
@@ -339,7 +408,6 @@ cdef class Octree:
         cdef const double* cell
         cdef Index k, at
         cdef int slot, m
-        self.walk(centre[0], centre[1], centre[2], radius, opening_angle, sources)
         single_reserve(near, sources.capacity, centre)
         single_reserve(far, sources.capacity, centre)
         for k in range(sources.n_atoms):
@@ -351,6 +419,8 @@ cdef class Octree:
             part.atoms[2 * part.capacity + at], part.atoms[3 * part.capacity + at] = <float>dz, <float>self.q[slot]
             part.n_atoms = at + 1
         for k in range(sources.n_cells):
+            if k + 8 < sources.n_cells:
+                prefetch(&self.cells[sources.cell[k + 8], 0])
             cell = &self.cells[sources.cell[k], 0]
             dx, dy, dz = cell[0] - centre[0], cell[1] - centre[1], cell[2] - centre[2]
             if cell[3] == 0.0:
@@ -458,6 +528,33 @@ cdef class Octree:
     def atoms(self):
         """Index of the atom in each slot, shape (n_slots,); -1 where an atom was removed."""
         return np.asarray(self.atom)[:self.n_slots]
+
+    def parted(self, const double[::1] ball, double opening_angle, double beyond, roots=(0,)):
+        """Sources for a ball (4,) that are farther than `beyond` from its centre [nm], and the nodes with all others.
+
+        Returns
+        -------
+        slots, cells, rest : list of int
+            Slots of atoms; nodes that act as cells; nodes whose subtrees contain the other atoms.
+        """
+        cdef Sources sources
+        cdef Nodes all_roots, rest
+        cdef int root
+        cdef Index k
+        sources_init(&sources)
+        all_roots.node = rest.node = NULL
+        all_roots.n = all_roots.capacity = rest.capacity = 0
+        for root in roots:
+            nodes_reserve(&all_roots, all_roots.n + 1)
+            all_roots.node[all_roots.n] = root
+            all_roots.n += 1
+        self.part(&all_roots, &ball[0], opening_angle, beyond, &sources, &rest)
+        result = ([sources.atom[k] for k in range(sources.n_atoms)], [sources.cell[k] for k in range(sources.n_cells)],
+                  [rest.node[k] for k in range(rest.n)])
+        sources_free(&sources)
+        free(all_roots.node)
+        free(rest.node)
+        return result
 
     @property
     def n_cancelling(self):

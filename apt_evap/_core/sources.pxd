@@ -35,11 +35,20 @@ cdef struct SingleSources:
     float* cells
 
 
+cdef struct Nodes:
+    # Nodes of an octree.
+    Index n, capacity
+    int* node            # (capacity,)
+
+
+cdef int nodes_reserve(Nodes* nodes, Index capacity) except -1 nogil
 cdef int sources_init(Sources* sources) except -1 nogil
 cdef int sources_grow(Sources* sources) except -1 nogil
 cdef void sources_free(Sources* sources) noexcept nogil
 cdef void sources_field(const Sources* sources, double px, double py, double pz, double* field) noexcept nogil
 cdef int single_reserve(SingleSources* single, Index capacity, const double* origin) except -1 nogil
+cdef int single_part(const SingleSources* single, const double* ball, SingleSources* inside, SingleSources* outside
+                     ) except -1 nogil
 cdef void single_pad(SingleSources* single) noexcept nogil
 cdef void single_free(SingleSources* single) noexcept nogil
 cdef void single_field(const SingleSources* single, double px, double py, double pz, double* field) noexcept nogil

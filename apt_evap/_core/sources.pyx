@@ -6,6 +6,18 @@ from libc.stdlib cimport free, malloc, realloc
 from apt_evap._core.index cimport Index
 
 
+cdef int nodes_reserve(Nodes* nodes, Index capacity) except -1 nogil:
+    # Space for this many nodes, with the present ones kept. The memory must be NULL, and capacity 0, at the first call.
+    cdef int* node
+    if capacity > nodes.capacity:
+        node = <int*>realloc(nodes.node, 2 * capacity * sizeof(int))
+        if node == NULL:
+            with gil:
+                raise MemoryError
+        nodes.node, nodes.capacity = node, 2 * capacity
+    return 0
+
+
 cdef int sources_init(Sources* sources) except -1 nogil:
     sources.n_atoms = sources.n_cells = 0
     sources.capacity = 4160   # not a power of two: the columns of a source would share one set of the cache
@@ -87,6 +99,39 @@ cdef int single_reserve(SingleSources* single, Index capacity, const double* ori
     for axis in range(3):
         single.origin[axis] = origin[axis]
     single.n_atoms = single.n_cells = 0
+    return 0
+
+
+cdef inline SingleSources* side(float x, float y, float z, const float* ball, SingleSources* inside,
+                                SingleSources* outside) noexcept nogil:
+    x, y, z = x - ball[0], y - ball[1], z - ball[2]
+    return inside if x * x + y * y + z * z <= ball[3] else outside
+
+
+cdef int single_part(const SingleSources* single, const double* ball, SingleSources* inside, SingleSources* outside
+                     ) except -1 nogil:
+    # Copies the sources in a ball relative to the origin, and the others.
+    cdef float[4] rounded
+    cdef SingleSources* part
+    cdef Index k, at, stride = single.capacity
+    cdef int m
+    single_reserve(inside, stride, single.origin)
+    single_reserve(outside, stride, single.origin)
+    for m in range(3):
+        rounded[m] = <float>ball[m]
+    rounded[3] = <float>(ball[3] * ball[3])
+    for k in range(single.n_atoms):
+        part = side(single.atoms[k], single.atoms[stride + k], single.atoms[2 * stride + k], rounded, inside, outside)
+        at = part.n_atoms
+        for m in range(4):
+            part.atoms[m * part.capacity + at] = single.atoms[m * stride + k]
+        part.n_atoms = at + 1
+    for k in range(single.n_cells):
+        part = side(single.cells[k], single.cells[stride + k], single.cells[2 * stride + k], rounded, inside, outside)
+        at = part.n_cells
+        for m in range(CELL):
+            part.cells[m * part.capacity + at] = single.cells[m * stride + k]
+        part.n_cells = at + 1
     return 0
 
 

@@ -279,3 +279,41 @@ def test_any_arrangement(n, leaf, seed, grid):
 def test_refuses_an_empty_tree():
     with pytest.raises(ValueError, match="at least one atom"):
         Octree(np.empty((0, 3)), np.empty(0))
+
+
+def test_far_sources_of_a_ball_and_the_rest(surface12):
+    """Every atom is in one part, once; the far ones and the rest, divided again, have the field of all atoms."""
+    positions, normals, charges = surface12
+    tree, top = Octree(positions, charges), int(positions[:, 2].argmax())
+    first, last = members(tree)
+    balls, cells, parents = tree.nodes
+    place = positions[top] + 0.4 * normals[top]
+    roots, far_slots, far_cells = [0], [], []
+    for radius, beyond in ((1.0, 3.0), (0.3, 0.9)):  # the second in the rest of the first
+        slots, nodes, rest = tree.parted(np.array([*place, radius]), 0.3, beyond, roots)
+        assert len(slots) > 50 and len(nodes) > 20 and rest
+        covered = np.zeros(tree.n_slots, int)
+        np.add.at(covered, slots, 1)
+        for node in nodes + rest:
+            covered[first[node] : last[node]] += 1
+        expected = np.zeros(tree.n_slots, int)
+        for node in roots:
+            expected[first[node] : last[node]] += 1
+        assert np.array_equal(covered, expected)
+        distances = np.linalg.norm(balls[nodes, :3] - place, axis=1)
+        assert (2 * balls[nodes, 3] < 0.3 * (distances - radius)).all()
+        assert np.linalg.norm(cells[nodes, :3] - place, axis=1).min() > beyond
+        assert np.linalg.norm(tree.positions[slots] - place, axis=1).min() > beyond
+        # nodes of the rest are not wholly within a larger one
+        up = parents[[node for node in rest if node not in roots]]
+        assert (np.linalg.norm(balls[up, :3] - place, axis=1) + balls[up, 3] > beyond).all()
+        far_slots, far_cells, roots = far_slots + slots, far_cells + nodes, rest
+    near = np.concatenate([np.arange(first[node], last[node]) for node in roots])
+    atoms = np.concatenate([near, far_slots])
+    found = twins.field(place[None], tree.positions[atoms], tree.charges[atoms])[0]
+    for x, y, z, charge, xx, xy, xz, yy, yz, zz in cells[far_cells]:
+        step = place - [x, y, z]
+        moment, s = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ step, np.linalg.norm(step)
+        found += (charge / s**3 + 2.5 * (moment @ step) / s**7) * step - moment / s**5
+    exact = twins.field(place[None], positions, charges)[0]
+    assert np.linalg.norm(found - exact) < 1e-4 * np.linalg.norm(exact)

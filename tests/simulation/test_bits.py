@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "4580e91f56ad35665efc1021e28ae4407bfd6a4206892d01545a8287c00bcbb6"
+FINGERPRINT = "26e6f8d344476d728ab4d677f16039ed6277fb4e4bf07b6c8311128eb6c84c24"
 PROGRAM = """
 import warnings
 
