@@ -23,6 +23,7 @@ from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
 from apt_evap.emission.surface_frame import tangent_frame
 from apt_evap.evaporation.emitter import Emitter
+from apt_evap.simulation.flight.response import ResponseModel
 from apt_evap.units import COULOMB
 
 NICKEL = ae.material("Ni")
@@ -381,6 +382,75 @@ def flight_errors(radii=(40, 80), shank=1.0, ions=300):
     return {"title": "flights alone, detector at 100 mm", "rows": rows}
 
 
+def bundle_errors(radii=(40, 80), shank=1.0, events=3000, ions=240, checked=90, repeats=5):
+    """Flights of the launches of responses, all of an ion together, and of one launch an ion; one thread.
+
+    Places of five launches of some ions are compared with those of sums over all atoms and steps with an error of 1e-6.
+    Two versions are compared by calls in turn with their folders in PYTHONPATH: events have the same bits.
+    """
+    rows, columns = [], np.array([0, 40, 62, 100, 139])
+    for radius in radii:
+        simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=1)
+        emitter, tip, n = simulation.emitter, simulation.tip, 0
+        evaporate(emitter, events)
+        model = ResponseModel(simulation.response_settings, simulation.detector)
+        settings = ae.simulation.FlightSettings()
+        seconds, errors, counts = np.zeros((2, repeats)), ([], []), np.zeros(2)
+        emitter.request_tree_copy()
+        for batch in emitter.advance(ions):
+            emitter.request_tree_copy()  # each batch has its own
+            if not len(batch):
+                continue
+            emissions = simulation._emissions(batch, np.arange(n, n + len(batch)))
+            positions, velocities = model.launches(emissions)
+            flown = np.flatnonzero(np.isfinite(positions).all(axis=(1, 2)))
+            some = flown[:: max(1, ions // checked)]
+            ends = []
+            for accuracy, numbers, launches, counted in (
+                (replace(settings, opening_angle=0.0, tolerance=1e-6), np.repeat(some, len(columns)), None, None),
+                (settings, flown, np.arange(positions.shape[1]), 0),
+                (settings, flown, columns[:1], 1),
+            ):
+                if launches is None:
+                    groups = positions[some][:, columns], velocities[some][:, columns]
+                else:
+                    groups = positions[flown][:, launches], velocities[flown][:, launches]
+                starts, pushes = (np.ascontiguousarray(group.reshape(-1, 3)) for group in groups)
+                for repeat in range(repeats if counted is not None else 1):
+                    flier = flier_over(batch.tree, tip, accuracy)
+                    start = time.process_time()
+                    end, _ = fly(flier, batch.journal, numbers, len(starts) // len(numbers), starts, pushes)
+                    if counted is not None:
+                        seconds[counted, repeat] += time.process_time() - start
+                if counted == 0:
+                    counts += flier.n_steps, flier.n_pairs
+                ahead = (tip.apex + 1e8 - end[:, 2]) / end[:, 5]  # a detector at 100 mm
+                places = (end[:, :2] + ahead[:, None] * end[:, 3:5]) / 1e3
+                ends.append(places.reshape(*groups[0].shape[:2], 2))
+            rows_of_some = np.searchsorted(flown, some)
+            errors[0].append(np.linalg.norm(ends[1][rows_of_some][:, columns] - ends[0], axis=-1).ravel())
+            errors[1].append(np.linalg.norm(ends[2][rows_of_some][:, 0] - ends[0][:, 0], axis=-1))
+            n += len(batch)
+        for number, name in enumerate((f"{positions.shape[1]} together", "alone")):
+            found = np.concatenate(errors[number])
+            rows.append(
+                {
+                    "R [a]": radius,
+                    "launches": name,
+                    "ions": n,
+                    "median time of an ion [us]": float(np.median(seconds[number])) / n * 1e6,
+                    "shortest [us]": float(seconds[number].min()) / n * 1e6,
+                    "steps": counts[0] / n if number == 0 else float("nan"),
+                    "pairs [1000]": counts[1] / n / 1e3 if number == 0 else float("nan"),
+                    "checked": len(found),
+                    "median [um]": float(np.median(found)),
+                    "95 % [um]": float(np.quantile(found, 0.95)),
+                    "largest [um]": float(found.max()),
+                }
+            )
+    return {"title": "launches of responses, detector at 100 mm, replay of the events included", "rows": rows}
+
+
 def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
     """Hit positions of a run against exact flights in the exact field: converged charges, sums over all atoms."""
     simulation = ae.Simulation(nickel_tip(radius, shank), seed=1, n_threads=n_threads)
@@ -518,6 +588,7 @@ PARTS = {
     "rates": rates,
     "flights": flights,
     "alone": flight_errors,
+    "bundles": bundle_errors,
     "charges": charge_errors,
     "potentials": potentials,
     "places": place_errors,

@@ -4,16 +4,16 @@ Flights are in reduced units: charge and mass of the ion are 1, so velocities ar
 the path of an ion depends only on its energy per charge. Flights that start together (one ion with many perturbations)
 have common steps, with one walk through the tree per step: the sources for a ball around all flights are collected
 once. For a group of flights, the field of distant sources is expanded about a ball around each part of the step (see
-`far_field`), because the group is narrow and the step is long; near sources are summed for every stage, with the
-flights in the vector lanes.
+`far_field`), because the group is narrow and the step is long. It contains that of larger balls, each for one or more
+steps, whose sources are summed once. Near sources are summed for every stage, with the flights in the vector lanes.
 
 The scheme is the Runge-Kutta-Nystrom pair of orders 8 and 6 of Dormand, El-Mikkawy and Prince (IMA J. Numer. Anal. 7,
 423, 1987), nine stages per step.
 """
 
 from libc.math cimport INFINITY, NAN, sqrt
-from libc.string cimport memcpy
 from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -93,7 +93,8 @@ cdef double LONE = 1.25
 
 # Sources far from a bundle are summed once for balls that contain one or some of its steps: at the start for balls of
 # AROUND lengths, later for a ball around the step, unless it is larger than LARGEST lengths. If there are at most FEW
-# sources, they are summed for every flight.
+# sources, they are summed for every flight. Measured as FAR, 450 launches: with (8, 2.5) / (6, 2) / (10, 3.5), places
+# deviate by 0.48 / 0.43 / 0.47 um (median) in the same time; without a bound, by 0.68 um in 0.97 of the time.
 cdef double[2] AROUND = [6.0, 2.0]
 cdef double LARGEST = 30.0
 cdef Index FEW = 8

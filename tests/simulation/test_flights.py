@@ -76,6 +76,21 @@ def test_hyperbola(tolerance):
     assert 1e4 < np.linalg.norm(end[0, :3]) < 1.01e4  # ends where it was asked to
 
 
+@pytest.mark.parametrize(("opening_angle", "bound"), [(0.0, 2e-9), (0.3, 2e-4)])
+def test_hyperbolas_of_a_bundle_whose_flights_end_in_different_steps(opening_angle, bound):
+    random = np.random.default_rng(3)
+    starts = START[0] + random.uniform(-0.1, 0.1, size=(23, 3))
+    push = START[0] + random.normal(size=(23, 3)) * np.linspace(0.1, 2.0, 23)[:, None]
+    settings = {"coulomb": 1.0, "length": 0.05, "reach": 200.0, "opening_angle": opening_angle, "tolerance": 1e-6}
+    end, outcome, flights = fly(POINT, starts, push, groups=[0, 23], **settings)
+    assert (outcome == LEFT).all()
+    assert len(np.unique(end[:, 6])) > 3  # some end earlier than others, and the rest go on without them
+    assert flights.n_evaluations < 23 * (8 * flights.n_steps + 1)
+    for launch in range(23):
+        # measured 6e-10; with expansions 1.0e-4, from a single charge that is 3 radii away
+        assert errors_against_hyperbola(end[launch], position=starts[launch], velocity=push[launch]).max() < bound
+
+
 def test_at_rest_in_the_field_of_a_charge():
     end, _, _ = fly(POINT, START, np.zeros((1, 3)), coulomb=1.0, reach=1e4, tolerance=1e-9)
     r0, r = np.linalg.norm(START), np.linalg.norm(end[0, :3])
