@@ -5,16 +5,19 @@ import math
 import numpy as np
 
 from apt_evap._common.small_matrices import matrix_product, products, pseudo_inverse
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
+from apt_evap._core.sphere_sums import sphere_equations
 
 
-def fit_sphere(points: Floats) -> tuple[Floats, float]:
+def fit_sphere(points: Floats, chosen: Integers | None = None) -> tuple[Floats, float]:
     """Algebraic least-squares sphere through points.
 
     Parameters
     ----------
     points : ndarray
-        At least four points [nm], shape (n, 3).
+        Points [nm], shape (n, 3).
+    chosen : ndarray of int, optional
+        Indices of at least four points that count, shape (m,); by default all.
 
     Returns
     -------
@@ -28,10 +31,7 @@ def fit_sphere(points: Floats) -> tuple[Floats, float]:
     The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. On a rough cap it is a
     little too small, and single points far inside make it smaller: `analysis.fit_caps` is robust against them.
     """
-    middle = points.mean(axis=0)
-    shifted = points - middle
-    matrix = np.column_stack([2.0 * shifted, np.ones(len(shifted))])
-    right = products(shifted, shifted)
-    inverse = pseudo_inverse(matrix_product(matrix.T, matrix))
-    *centre, rest = matrix_product(inverse, matrix_product(matrix.T, right)).tolist()
+    chosen = np.arange(len(points)) if chosen is None else chosen
+    middle, matrix, right = sphere_equations(np.ascontiguousarray(points, np.float64), chosen)
+    *centre, rest = matrix_product(pseudo_inverse(matrix), right).tolist()
     return middle + centre, math.sqrt(max(rest + float(products(centre, centre)), 0.0))

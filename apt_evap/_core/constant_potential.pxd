@@ -25,6 +25,6 @@ cdef class ConstantPotential(FieldRule):
     cdef double at(self, Octree tree, Index slot) noexcept nogil
     cdef double corrections(self, Octree tree, Index slot, const double* sources, Index n) noexcept nogil
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil
-    cdef void act_on(self, const Hole* hole, Index first, Index m, Index padded, Index n, const float* x,
+    cdef void act_on(self, const Hole* hole, Index first, Index m, Index stride, Index n, const float* x,
                      const float* y, const float* z, const float* change) noexcept nogil
     cdef void correct_spread(self, const Hole* hole, const Patch* patch) noexcept nogil

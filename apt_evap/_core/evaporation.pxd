@@ -39,7 +39,7 @@ cdef class Evaporation:
     cdef int[::1] patch_slot
     cdef double[::1] patch_charge
     cdef float[:, ::1] patch_float      # (8, capacity)
-    cdef int[::1] far_slot              # (capacity,)
+    cdef int[::1] ring_slot, far_slot   # (capacity,) slots around the patch, near and far
     cdef double[::1] strength, key      # (capacity,) of the patch, for the law
     cdef Index[::1] key_atom
     cdef int[::1] key_bonds
@@ -51,6 +51,7 @@ cdef class Evaporation:
                                    double* charge) noexcept nogil
     cdef void add_to_patch(self, int slot, double dx, double dy, double dz) noexcept nogil
     cdef void sort_near_first(self, Hole* hole) noexcept nogil
+    cdef void put_around(self, Hole* hole, Index i, int slot) noexcept nogil
     cdef int surroundings(self, Index atom) noexcept nogil
     cdef double hopping(self, double key, double strength, Index atom) noexcept nogil
     cdef int update_keys(self, const int* slots, Index n) except -1 nogil

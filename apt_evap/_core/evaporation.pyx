@@ -125,7 +125,7 @@ cdef class Evaporation:
         self.patch.z, self.patch.change = &self.patch_float[2, 0], &self.patch_float[3, 0]
         self.patch.merged_x, self.patch.merged_y = &self.patch_float[4, 0], &self.patch_float[5, 0]
         self.patch.merged_z, self.patch.merged_change = &self.patch_float[6, 0], &self.patch_float[7, 0]
-        self.far_slot = np.empty(capacity + MAX_NEAR, np.int32)
+        self.ring_slot, self.far_slot = np.empty((2, capacity + MAX_NEAR), np.int32)
         self.strength, self.key = np.empty(capacity + MAX_NEAR), np.empty(capacity + MAX_NEAR)
         self.key_atom, self.key_bonds = np.empty(capacity + MAX_NEAR, np.int64), np.empty(capacity + MAX_NEAR, np.int32)
 
@@ -343,22 +343,36 @@ cdef class Evaporation:
         self.patch.n = n + 1
 
     cdef void sort_near_first(self, Hole* hole) noexcept nogil:
-        # Order the slots around a hole: first those near the patch.
-        cdef double near = self.rule.near * self.patch_radius, dx, dy, dz
-        cdef Index i, n_far = 0
+        # Order the slots around a hole: first those of the patch, then the other near ones.
+        cdef double near = self.rule.near * self.patch_radius, dx, dy, dz, s
+        cdef Index i, n_ring = 0, n_far = 0
         cdef int slot
-        hole.n_near = 0
         for i in range(hole.n):
             slot = hole.slot[i]
             dx, dy, dz = self.tree.x[slot] - hole.x, self.tree.y[slot] - hole.y, self.tree.z[slot] - hole.z
-            if dx * dx + dy * dy + dz * dz <= near * near:
-                hole.slot[hole.n_near] = slot
-                hole.n_near += 1
+            s = dx * dx + dy * dy + dz * dz
+            if s <= self.patch_radius * self.patch_radius:
+                self.add_to_patch(slot, dx, dy, dz)
+            elif s <= near * near:
+                self.ring_slot[n_ring] = slot
+                n_ring += 1
             else:
                 self.far_slot[n_far] = slot
                 n_far += 1
+        hole.n_near = self.patch.n + n_ring
+        for i in range(self.patch.n):
+            hole.slot[i] = self.patch.slot[i]
+            hole.near_x[i], hole.near_y[i], hole.near_z[i] = self.patch.x[i], self.patch.y[i], self.patch.z[i]
+        for i in range(n_ring):
+            self.put_around(hole, self.patch.n + i, self.ring_slot[i])
         for i in range(n_far):
-            hole.slot[hole.n_near + i] = self.far_slot[i]
+            self.put_around(hole, hole.n_near + i, self.far_slot[i])
+
+    cdef void put_around(self, Hole* hole, Index i, int slot) noexcept nogil:
+        hole.slot[i] = slot
+        hole.near_x[i] = <float>(self.tree.x[slot] - hole.x)
+        hole.near_y[i] = <float>(self.tree.y[slot] - hole.y)
+        hole.near_z[i] = <float>(self.tree.z[slot] - hole.z)
 
     cdef int surroundings(self, Index atom) noexcept nogil:
         # Bonds of an atom for the law: their number, or their code.
@@ -394,8 +408,7 @@ cdef class Evaporation:
 
     cdef int event(self, Index atom, Journal journal) except -1 nogil:
         cdef int[MAX_NEAR] fresh
-        cdef int removed_slot = self.slot_of[atom], n_fresh, slot
-        cdef double dx, dy, dz, s
+        cdef int removed_slot = self.slot_of[atom], n_fresh
         cdef Hole* hole = &self.hole
         cdef Patch* patch = &self.patch
         cdef Index capacity, i, at
@@ -407,13 +420,14 @@ cdef class Evaporation:
         self.n_removed += 1
         self.since_relaxation += 1
         self.tree.remove_atom(removed_slot)
-        self.tree.refresh()
         self.slot_of[atom] = -1
         self.chooser.key[removed_slot] = -INFINITY
         self.chooser.update(&removed_slot, 1)
         n_fresh = self.atoms.remove(atom, fresh)
+        if n_fresh > 0:   # for the fields at these
+            self.tree.refresh()
 
-        # subtract the evaporated charge from the fields of the slots around the hole, and add the exposed atoms
+        # the slots around the hole; subtract the evaporated charge from the fields of the patch, add the exposed atoms
         capacity = self.hole_slot.shape[0] - MAX_NEAR - PATCH_LANES
         hole.n = self.tree.within(hole.x, hole.y, hole.z, self.update_radius, hole.slot, capacity)
         if hole.n > capacity:
@@ -423,28 +437,23 @@ cdef class Evaporation:
         patch.n = patch.n_clipped = 0
         patch.unsettled = False
         self.sort_near_first(hole)
-        for i in range(hole.n):
-            slot = hole.slot[i]
-            dx, dy, dz = self.tree.x[slot] - hole.x, self.tree.y[slot] - hole.y, self.tree.z[slot] - hole.z
-            hole.near_x[i], hole.near_y[i], hole.near_z[i] = <float>dx, <float>dy, <float>dz
-            s = dx * dx + dy * dy + dz * dz
-            if s <= self.patch_radius * self.patch_radius:
-                self.add_to_patch(slot, dx, dy, dz)
-        self.rule.removed(self.tree, hole)
+        self.rule.removed(self.tree, hole, patch.n)
         self.expose(fresh, n_fresh, removed_slot, journal)
 
-        # solve the charges of the patch with all others fixed, and add their changes to the fields around it; padding
-        # is far away and has no charge
+        # solve the charges of the patch with all others fixed, and add the changes, also that by the evaporated charge,
+        # to the fields around it; padding is far away and has no charge
         patch.stride = (patch.n + PATCH_LANES - 1) // PATCH_LANES * PATCH_LANES
         for i in range(patch.n, patch.stride):
             patch.x[i] = patch.y[i] = patch.z[i] = 1e6
             patch.change[i] = 0.0
         for i in range(hole.n):
             self.disturbed[hole.slot[i]] = 1
-        for i in range(hole.n, (hole.n + GROUP - 1) // GROUP * GROUP):
+        for i in range(hole.n, hole.n + GROUP):
             hole.near_x[i] = hole.near_y[i] = hole.near_z[i] = 1e6
         if patch.n:
             self.rule.solve_patch(self.tree, self.normals, hole, patch)
+        else:
+            self.rule.removed(self.tree, hole, hole.n)
         self.n_clipped += patch.n_clipped
         self.n_unsettled += patch.unsettled
 
@@ -512,13 +521,13 @@ cdef class Evaporation:
             slot = <int>self.tree.insert_atom(fresh[k], px, py, pz, self.tree.leaf[best])
             self.slot_of[fresh[k]] = slot
             self.rule.exposed(self.tree, slot, self.opening_angle)
-            i, at = hole.n_near, hole.n   # the first of the distant slots becomes the last one
-            hole.slot[at] = hole.slot[i]
-            hole.near_x[at], hole.near_y[at], hole.near_z[at] = hole.near_x[i], hole.near_y[i], hole.near_z[i]
-            hole.slot[i] = slot
-            hole.near_x[i], hole.near_y[i] = <float>(px - hole.x), <float>(py - hole.y)
-            hole.near_z[i] = <float>(pz - hole.z)
-            hole.n, hole.n_near = at + 1, i + 1
+            # the first of the distant slots becomes the last one, and the first one around the patch the last near one
+            if hole.n_near < hole.n:
+                self.put_around(hole, hole.n, hole.slot[hole.n_near])
+            if self.patch.n < hole.n_near:
+                self.put_around(hole, hole.n_near, hole.slot[self.patch.n])
+            self.put_around(hole, self.patch.n, slot)
+            hole.n, hole.n_near = hole.n + 1, hole.n_near + 1
             self.add_to_patch(slot, px - hole.x, py - hole.y, pz - hole.z)
         return 0
 

@@ -23,5 +23,7 @@ cdef class InteractionLists:
     cdef void split(self, Octree tree, int* slots, Index n, Index group) noexcept nogil
     cdef void walk(self, Octree tree, Index group, double opening_angle, int* cells, int* ranges,
                    Index* counts) noexcept nogil
+    cdef void add_to_group(self, Octree tree, Index group, double[:, ::1] field, const double* changes,
+                           const double* charge) noexcept nogil
     cdef void sweep_single(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil
     cdef void sweep_double(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil

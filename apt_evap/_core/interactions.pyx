@@ -21,6 +21,8 @@ cdef extern from "kernels.h":
     void group_atoms_single(Index, const int*, const double*, const double*, const double*, const double*,
                             const double*, const float*, float*) noexcept nogil
     void group_cells_single(Index, const int*, const double*, const double*, const float*, float*) noexcept nogil
+    void group_charges_single(Index, const int*, const double*, const double*, const double*, const float*,
+                              float*) noexcept nogil
     void group_atoms_double(Index, const int*, const double*, const double*, const double*, const double*,
                             const double*, const double*, double*) noexcept nogil
     void point_atoms_double(Index, const double*, const double*, const double*, const double*,
@@ -294,6 +296,54 @@ cdef class InteractionLists:
                 self.sweep_double(tree, group, field)
             else:
                 self.sweep_single(tree, group, field)
+
+    def add_changes(self, double[:, ::1] field, const double[::1] changes, int n_threads=1):
+        """Add the field of changes of the charges at each target, with cells that have only a charge in their middle.
+
+        Parameters
+        ----------
+        field : ndarray, shape (n, 3) or longer
+            Field [e/nm^2], in the order of the slots; that of the targets is changed.
+        changes : ndarray, shape (n,)
+            Changes of the charges of the slots [e], of either sign.
+        n_threads : int
+            Number of threads.
+        """
+        cdef Octree tree = self.tree
+        cdef Index group, node, k
+        cdef double[::1] charge = np.zeros(tree.n_nodes)
+        with nogil:
+            for node in range(tree.n_nodes - 1, -1, -1):
+                k = tree.first[node] if tree.skip[node] == node + 1 else -1
+                while k >= 0:
+                    charge[node] += changes[k]
+                    k = tree.following(node, k)
+                if node > 0:
+                    charge[tree.parent[node]] += charge[node]
+        for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=8, num_threads=n_threads):
+            self.add_to_group(tree, group, field, &changes[0], &charge[0])
+
+    cdef void add_to_group(self, Octree tree, Index group, double[:, ::1] field, const double* changes,
+                           const double* charge) noexcept nogil:
+        cdef float[6 * 32] work
+        cdef Index first = self.starts[group, 0], range_first = self.starts[group, 1], lane, k
+        cdef const double* ball = &self.ball[group, 0]
+        for lane in range(GROUP):
+            k = self.members[group, lane]
+            work[lane] = <float>(tree.x[k] - ball[0])
+            work[GROUP + lane] = <float>(tree.y[k] - ball[1])
+            work[2 * GROUP + lane] = <float>(tree.z[k] - ball[2])
+            work[3 * GROUP + lane] = work[4 * GROUP + lane] = work[5 * GROUP + lane] = 0.0
+        group_charges_single(self.starts[group + 1, 0] - first, &self.cells[0] + first, &tree.ball[0, 0], charge, ball,
+                             work, work + 3 * GROUP)
+        group_atoms_single(self.starts[group + 1, 1] - range_first, &self.ranges[0] + 2 * range_first, &tree.x[0],
+                           &tree.y[0], &tree.z[0], changes, ball, work, work + 3 * GROUP)
+        for lane in range(GROUP):
+            k = self.members[group, lane]
+            if lane == 0 or k != self.members[group, lane - 1]:   # not an atom that pads the group
+                field[k, 0] += work[3 * GROUP + lane]
+                field[k, 1] += work[4 * GROUP + lane]
+                field[k, 2] += work[5 * GROUP + lane]
 
     cdef void sweep_single(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil:
         cdef float[6 * 32] work

@@ -126,25 +126,116 @@ APT_CLONES static void add_polynomials(int degree, const float *restrict coeffic
  * of a dot product wait for each other. */
 #define PATCH_LANES 64
 
-/* One column of the Robin matrix: column[k] = factor n_k . (r_k - p)/|r_k - p|^3 for the atom at p, with the normals n. */
+/* One column of the Robin matrix: column[k] = factor n_k . (r_k - p)/|r_k - p|^3 for the atom at p, with the normals n;
+ * and cubes[k] = 1/|r_k - p|^3. */
 APT_CLONES static void patch_column(Index n, const float *restrict x, const float *restrict y, const float *restrict z,
                                     const float *restrict nx, const float *restrict ny, const float *restrict nz,
-                                    float px, float py, float pz, float factor, float *restrict column)
+                                    float px, float py, float pz, float factor, float *restrict column,
+                                    float *restrict cubes)
 {
 #pragma omp simd
     for (Index k = 0; k < n; k++) {
         const float dx = x[k] - px, dy = y[k] - py, dz = z[k] - pz;
         const float s = dx * dx + dy * dy + dz * dz;
-        column[k] = s > (float)SAME_PLACE ? factor * (nx[k] * dx + ny[k] * dy + nz[k] * dz) / (s * sqrtf(s)) : 0.0f;
+        const float cube = s > (float)SAME_PLACE ? 1.0f / (s * sqrtf(s)) : 0.0f;
+        cubes[k] = cube;
+        column[k] = factor * (nx[k] * dx + ny[k] * dy + nz[k] * dz) * cube;
     }
 }
 
-/* sums[k] += factor column[k]. */
-APT_CLONES static void patch_add(Index n, float factor, const float *restrict column, float *restrict sums)
+/* One Gauss-Seidel iteration of the changes: each in turn becomes its right side, and its step times its column is added
+ * to all right sides. Returns the largest step. Columns go by blocks of PATCH_LANES atoms: the steps of a block first
+ * change its own right sides, then those of each other block, which stay in registers. */
+APT_CLONES static float patch_iteration(Index n, Index stride, const float *restrict columns, float *restrict right,
+                                        float *restrict change)
 {
+    float largest = 0.0f;
+    for (Index first = 0; first < n; first += PATCH_LANES) {
+        const Index m = n - first < PATCH_LANES ? n - first : PATCH_LANES;
+        const float *restrict block = columns + first * stride;
+        float step[PATCH_LANES];
+        for (Index i = 0; i < m; i++) {
+            const float *restrict column = block + i * stride + first;
+            float *restrict own = right + first;
+            const float factor = own[i] - change[first + i];
+            step[i] = factor;
+            largest = fabsf(factor) > largest ? fabsf(factor) : largest;
+            change[first + i] = own[i];
 #pragma omp simd
-    for (Index k = 0; k < n; k++)
-        sums[k] += factor * column[k];
+            for (int l = 0; l < PATCH_LANES; l++)
+                own[l] += factor * column[l];
+        }
+        for (Index other = 0; other < stride; other += PATCH_LANES) {
+            float sum[PATCH_LANES];
+            if (other == first)
+                continue;
+            memcpy(sum, right + other, sizeof sum);
+            for (Index i = 0; i < m; i++) {
+                const float *restrict column = block + i * stride + other;
+                const float factor = step[i];
+#pragma omp simd
+                for (int l = 0; l < PATCH_LANES; l++)
+                    sum[l] += factor * column[l];
+            }
+            memcpy(right + other, sum, sizeof sum);
+        }
+    }
+    return largest;
+}
+
+/* Field of the n charges q of a patch at its atoms, from 1/r^3 in n rows of `stride` numbers: sum w (r - r_i) with
+ * w = q_i/r^3, as r sum w - sum w r_i. */
+APT_CLONES static void patch_field_of_cubes(Index n, Index stride, const float *restrict cubes, const float *restrict x,
+                                            const float *restrict y, const float *restrict z, const float *restrict q,
+                                            float *restrict field_x, float *restrict field_y, float *restrict field_z)
+{
+    for (Index first = 0; first < stride; first += GROUP) {
+        float sum[GROUP] = {0}, sx[GROUP] = {0}, sy[GROUP] = {0}, sz[GROUP] = {0};
+        for (Index i = 0; i < n; i++) {
+            const float *restrict row = cubes + i * stride + first;
+            const float charge = q[i], px = x[i], py = y[i], pz = z[i];
+#pragma omp simd
+            for (int l = 0; l < GROUP; l++) {
+                const float w = charge * row[l];
+                sum[l] += w;
+                sx[l] += w * px;
+                sy[l] += w * py;
+                sz[l] += w * pz;
+            }
+        }
+#pragma omp simd
+        for (int l = 0; l < GROUP; l++) {
+            field_x[first + l] = sum[l] * x[first + l] - sx[l];
+            field_y[first + l] = sum[l] * y[first + l] - sy[l];
+            field_z[first + l] = sum[l] * z[first + l] - sz[l];
+        }
+    }
+}
+
+/* The same from 1/r, whose value for an atom itself does not matter. */
+APT_CLONES static void patch_field_of_inverse(Index n, Index stride, const float *restrict inverse,
+                                              const float *restrict x, const float *restrict y, const float *restrict z,
+                                              const float *restrict q, float *restrict field_x, float *restrict field_y,
+                                              float *restrict field_z)
+{
+    for (Index first = 0; first < stride; first += GROUP) {
+        float ex[GROUP] = {0}, ey[GROUP] = {0}, ez[GROUP] = {0};
+        const float *restrict tx = x + first, *restrict ty = y + first, *restrict tz = z + first;
+        for (Index i = 0; i < n; i++) {
+            const float *restrict row = inverse + i * stride + first;
+            const float charge = q[i], px = x[i], py = y[i], pz = z[i];
+#pragma omp simd
+            for (int l = 0; l < GROUP; l++) {
+                const float w = charge * (row[l] * row[l] * row[l]);
+                ex[l] += w * (tx[l] - px);
+                ey[l] += w * (ty[l] - py);
+                ez[l] += w * (tz[l] - pz);
+            }
+        }
+        memcpy(field_x + first, ex, sizeof ex);
+        memcpy(field_y + first, ey, sizeof ey);
+        memcpy(field_z + first, ez, sizeof ez);
+    }
 }
 
 /* Product of n columns of `stride` numbers with the numbers a: no sums over lanes, which take as long as the products. */

@@ -74,6 +74,38 @@ APT_CLONES static void GROUP_NAME(group_cells)(Index n, const int *list, const d
     memcpy(field + 2 * GROUP, ez, sizeof ez);
 }
 
+/* Cells that have only a charge, in the middle of their ball; in two halves as above. */
+APT_CLONES static void GROUP_NAME(group_charges)(Index n, const int *list, const double *balls, const double *charges,
+                                                 const double *origin, const REAL *restrict targets,
+                                                 REAL *restrict field)
+{
+    REAL tx[GROUP], ty[GROUP], tz[GROUP], ex[GROUP], ey[GROUP], ez[GROUP];
+    memcpy(tx, targets, sizeof tx);
+    memcpy(ty, targets + GROUP, sizeof ty);
+    memcpy(tz, targets + 2 * GROUP, sizeof tz);
+    memcpy(ex, field, sizeof ex);
+    memcpy(ey, field + GROUP, sizeof ey);
+    memcpy(ez, field + 2 * GROUP, sizeof ez);
+    for (Index k = 0; k < n; k++) {
+        const double *ball = balls + 4 * (Index)list[k];
+        const REAL sx = (REAL)(ball[0] - origin[0]), sy = (REAL)(ball[1] - origin[1]);
+        const REAL sz = (REAL)(ball[2] - origin[2]), charge = (REAL)charges[list[k]];
+        for (int h = 0; h < GROUP; h += 16)
+#pragma omp simd
+            for (int l = h; l < h + 16; l++) {
+                const REAL dx = tx[l] - sx, dy = ty[l] - sy, dz = tz[l] - sz;
+                const REAL s = dx * dx + dy * dy + dz * dz;
+                const REAL w = charge / (s * REAL_SQRT(s));
+                ex[l] += w * dx;
+                ey[l] += w * dy;
+                ez[l] += w * dz;
+            }
+    }
+    memcpy(field, ex, sizeof ex);
+    memcpy(field + GROUP, ey, sizeof ey);
+    memcpy(field + 2 * GROUP, ez, sizeof ez);
+}
+
 /* Potentials: partial sums over at most CHUNK sources in REAL, starting from `zero`, are added to `potential` in double,
  * because a potential is a sum of many terms of one sign, of which only small differences matter. `zero` is an array of
  * GROUP zeros in memory: with a constant, GCC 12 replaces the lanes by scalars. */

@@ -18,6 +18,7 @@ cdef class Robin(FieldRule):
     cdef double clearance               # initial distance of this point from the surface [nm]
     cdef double far_scale               # factor of the charges far from the holes since the whole surface was solved
     cdef float[::1] matrix, columns
+    cdef float[::1] cubes               # 1/r^3 between the slots of a patch, by rows [1/nm^3]
 
     cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists)
     cdef scale_others(self, Octree tree, InteractionLists lists, ratios)

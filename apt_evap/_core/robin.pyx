@@ -5,7 +5,7 @@ that the total charge is conserved (Robin, 1886; Rolland et al., Microsc. Microa
 """
 
 cimport cython
-from libc.math cimport M_PI, fabsf, sqrt
+from libc.math cimport M_PI, sqrt
 
 import numpy as np
 
@@ -19,9 +19,18 @@ from apt_evap._core.interactions cimport InteractionLists
 
 cdef extern from "kernels.h":
     void patch_column(Index, const float*, const float*, const float*, const float*, const float*, const float*,
-                      float, float, float, float, float*) noexcept nogil
-    void patch_add(Index, float, const float*, float*) noexcept nogil
+                      float, float, float, float, float*, float*) noexcept nogil
+    float patch_iteration(Index, Index, const float*, float*, float*) noexcept nogil
+    void patch_field_of_cubes(Index, Index, const float*, const float*, const float*, const float*, const float*,
+                              float*, float*, float*) noexcept nogil
 
+
+ROUGH_ERROR = 0.05
+"""Error of the field of changes of the charges by `add_changes` over that field, at most.
+
+Measured (Ni[111], R = 40 a, 12 relaxations): the errors of the charges after a relaxation are the same to two digits
+with sweeps instead, which take 1.7 times as long.
+"""
 
 OUTLIER = 4.0
 """Deviation of a ratio of fields from a smooth function over the median deviation, above which it is not used."""
@@ -187,14 +196,19 @@ cdef class Robin(FieldRule):
         cdef double residual = np.inf
         if lists.disturbed is None:
             self.field = np.zeros((tree.x.shape[0], 3))
-        charges = tree.charges
+        at_slots = charges = tree.charges   # without new moments of the tree
         total = elementary.total(charges)
         maps, steps = [], []   # results of the last sweeps of Robin's iteration, and their changes
         while sweeps < max_sweeps:
             sweeps += 1
             # fields of the targets; those of all other atoms are scaled by the ratios of the samples
             before = self.sample_fields(normals, lists)
-            lists.sweep(self.field, double_precision, n_threads)
+            if sweeps == 1 or double_precision or ROUGH_ERROR * residual > tolerance:
+                tree.refresh_all()
+                lists.sweep(self.field, double_precision, n_threads)
+            else:
+                lists.add_changes(self.field, tree.charges - charges, n_threads)
+            charges = tree.charges.copy()
             if len(before):
                 after = self.sample_fields(normals, lists)
                 unknown = np.full(len(before), np.nan)
@@ -210,12 +224,13 @@ cdef class Robin(FieldRule):
             steps.append(flux - charges)
             residual = np.abs(steps[-1]).max() * n / total
             if residual < tolerance:
-                tree.charges = flux
+                at_slots[:] = flux
                 break
             # next charges from the last sweeps, none of them negative
             mixed = np.maximum(self.mixed(maps, steps), 0.0)
             mixed *= total / elementary.total(mixed)
-            tree.charges = mixed
+            at_slots[:] = mixed
+        tree.refresh_all()
         return sweeps, residual
 
     cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists):
@@ -312,8 +327,8 @@ cdef class Robin(FieldRule):
         cdef double dx = x - self.inner[0], dy = y - self.inner[1], dz = z - self.inner[2]
         return charge / (max(sqrt(dx * dx + dy * dy + dz * dz), 1e-3 * self.clearance) * self.potential)
 
-    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
-        FieldRule.removed(self, tree, hole)
+    cdef void removed(self, Octree tree, const Hole* hole, Index n_patch) noexcept nogil:
+        FieldRule.removed(self, tree, hole, n_patch)
         self.drift -= self.inside(hole.x, hole.y, hole.z, hole.charge)
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
@@ -335,15 +350,15 @@ cdef class Robin(FieldRule):
     cdef int grow(self, Index stride) except -1 nogil:
         if 4 * stride > self.columns.shape[0]:
             with gil:
-                self.matrix = np.zeros(stride * stride, np.float32)
+                self.matrix, self.cubes = np.zeros((2, stride * stride), np.float32)
                 self.columns = np.zeros(4 * stride, np.float32)
         return 0
 
     cdef int patch_charges(self, Octree tree, double[:, ::1] normals, Patch* patch) except -1 nogil:
         # Gauss-Seidel iteration of the changes: x_i = r_i + (s/2 pi) sum_k K_ik x_k with the residual r_i of the old
-        # charges. A new x_i changes all right sides by a column of the matrix.
+        # charges.
         cdef double c = self.area / (2.0 * M_PI), mean = 0.0
-        cdef float step, largest = 0.0
+        cdef float largest = 0.0
         cdef Index i, slot, n = patch.n, stride = patch.stride
         cdef int _iteration, axis
         self.grow(stride)
@@ -362,17 +377,15 @@ cdef class Robin(FieldRule):
             right[i] = normal[i] = normal[stride + i] = normal[2 * stride + i] = 0.0
         for i in range(n):
             patch_column(stride, patch.x, patch.y, patch.z, normal, normal + stride, normal + 2 * stride, patch.x[i],
-                         patch.y[i], patch.z[i], <float>c, &self.matrix[i * stride])
+                         patch.y[i], patch.z[i], <float>c, &self.matrix[i * stride], &self.cubes[i * stride])
         for _iteration in range(60):
-            largest = 0.0
-            for i in range(n):
-                step = right[i] - patch.change[i]
-                largest = max(largest, fabsf(step))
-                patch.change[i] = right[i]
-                patch_add(stride, step, &self.matrix[i * stride], right)
+            largest = patch_iteration(n, stride, &self.matrix[0], right, patch.change)
             if largest <= self.tolerance * mean:
                 break
         for i in range(n):
             patch.charge[i] = tree.q[patch.slot[i]] + patch.change[i]
         patch.unsettled = largest > self.tolerance * mean
         return 0
+
+    cdef void field_in_patch(self, const Hole* hole, const Patch* patch, float* x, float* y, float* z) noexcept nogil:
+        patch_field_of_cubes(patch.n, patch.stride, &self.cubes[0], patch.x, patch.y, patch.z, patch.change, x, y, z)

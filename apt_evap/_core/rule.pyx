@@ -18,8 +18,9 @@ cdef extern from "kernels.h":
                      const float*, float*, float*, float*) noexcept nogil
 
 
-cdef void merge(Octree tree, Patch* patch) noexcept nogil:
-    # Merge up to four successive changes of one sign in one leaf into one at their centre of charge.
+cdef void merge(Octree tree, const Hole* hole, Patch* patch) noexcept nogil:
+    # Merge up to four successive changes of one sign in one leaf into one at their centre of charge. The evaporated
+    # charge becomes a source of the surroundings of the patch.
     cdef double x, y, z, total, change
     cdef Index i = 0, n = 0, end
     cdef int leaf
@@ -38,10 +39,18 @@ cdef void merge(Octree tree, Patch* patch) noexcept nogil:
             patch.merged_x[n], patch.merged_y[n] = <float>(x / total), <float>(y / total)
             patch.merged_z[n], patch.merged_change[n] = <float>(z / total), <float>total
             n += 1
-    patch.n_merged = (n + 7) // 8 * 8
-    for i in range(n, patch.n_merged):
-        patch.merged_x[i] = patch.merged_y[i] = patch.merged_z[i] = 1e6
-        patch.merged_change[i] = 0.0
+    patch.merged_x[n] = patch.merged_y[n] = patch.merged_z[n] = 0.0
+    patch.merged_change[n] = <float>-hole.charge
+    patch.n_merged = n + 1
+    patch.x[patch.n] = patch.y[patch.n] = patch.z[patch.n] = 0.0
+    patch.change[patch.n] = <float>-hole.charge
+
+
+cdef Index ring(const Hole* hole, const Patch* patch, Index* n_near) noexcept nogil:
+    # Number of slots around the patch, and of the near ones among them, both padded to multiples of GROUP.
+    cdef Index padded = (hole.n - patch.n + GROUP - 1) // GROUP * GROUP
+    n_near[0] = min((hole.n_near - patch.n + GROUP - 1) // GROUP * GROUP, padded)
+    return padded
 
 
 cdef class ChargingRule:
@@ -140,8 +149,9 @@ cdef class ChargingRule:
         """
         return np.full(len(chosen), np.nan)
 
-    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
-        # An atom has evaporated, with its charge: the tree no longer contains it.
+    cdef void removed(self, Octree tree, const Hole* hole, Index n_patch) noexcept nogil:
+        # An atom has evaporated, with its charge: the tree no longer contains it. The first slots around the hole are
+        # those of the patch; the others see the removal in `solve_patch`.
         pass
 
     cdef int exposed(self, Octree tree, Index slot, double opening_angle) except -1 nogil:
@@ -167,16 +177,16 @@ cdef class FieldRule(ChargingRule):
 
     def __cinit__(self, *args, **kwargs):
         sources_init(&self.sources)
-        self.near = 1.3
+        self.near = 1.0
 
     def __dealloc__(self):
         sources_free(&self.sources)
 
-    cdef void removed(self, Octree tree, const Hole* hole) noexcept nogil:
+    cdef void removed(self, Octree tree, const Hole* hole, Index n_patch) noexcept nogil:
         cdef double dx, dy, dz, s, over
         cdef Index i
         cdef int slot
-        for i in range(hole.n):
+        for i in range(n_patch):
             slot = hole.slot[i]
             dx, dy, dz = tree.x[slot] - hole.x, tree.y[slot] - hole.y, tree.z[slot] - hole.z
             s = dx * dx + dy * dy + dz * dz
@@ -191,7 +201,7 @@ cdef class FieldRule(ChargingRule):
         return 0
 
     cdef int solve_patch(self, Octree tree, double[:, ::1] normals, const Hole* hole, Patch* patch) except -1 nogil:
-        cdef Index i, near, padded = (hole.n + GROUP - 1) // GROUP * GROUP
+        cdef Index i, near, padded = ring(hole, patch, &near), first = patch.n
         cdef int slot
         cdef float *field_x
         cdef float *field_y
@@ -202,19 +212,20 @@ cdef class FieldRule(ChargingRule):
                 patch.change[i] = <float>-tree.q[patch.slot[i]]
                 patch.charge[i] = 0.0
                 patch.n_clipped += 1
-        if padded > self.spread.shape[1]:
+        if patch.stride + padded > self.spread.shape[1]:
             with gil:
-                self.spread = np.empty((3, 2 * padded), np.float32)
+                self.spread = np.empty((3, 2 * (patch.stride + padded)), np.float32)
         field_x, field_y, field_z = &self.spread[0, 0], &self.spread[1, 0], &self.spread[2, 0]
-        for i in range(padded):
+        self.field_in_patch(hole, patch, field_x, field_y, field_z)
+        for i in range(first, first + padded):
             field_x[i] = field_y[i] = field_z[i] = 0.0
-        near = min((hole.n_near + GROUP - 1) // GROUP * GROUP, padded)
-        patch_field(near, hole.near_x, hole.near_y, hole.near_z, patch.stride, patch.x, patch.y, patch.z, patch.change,
-                    field_x, field_y, field_z)
-        merge(tree, patch)
-        patch_field(padded - near, hole.near_x + near, hole.near_y + near, hole.near_z + near, patch.n_merged,
-                    patch.merged_x, patch.merged_y, patch.merged_z, patch.merged_change, field_x + near, field_y + near,
-                    field_z + near)
+        merge(tree, hole, patch)
+        patch_field(near, hole.near_x + first, hole.near_y + first, hole.near_z + first, patch.n + 1, patch.x, patch.y,
+                    patch.z, patch.change, field_x + first, field_y + first, field_z + first)
+        first += near
+        patch_field(padded - near, hole.near_x + first, hole.near_y + first, hole.near_z + first, patch.n_merged,
+                    patch.merged_x, patch.merged_y, patch.merged_z, patch.merged_change, field_x + first,
+                    field_y + first, field_z + first)
         for i in range(hole.n):
             slot = hole.slot[i]
             self.field[slot, 0] += field_x[i]
@@ -226,6 +237,13 @@ cdef class FieldRule(ChargingRule):
         # New charges of a patch and their changes, from the fields at its slots and the charges in the tree.
         with gil:
             raise NotImplementedError(f"{type(self).__name__} has no patch_charges")
+
+    cdef void field_in_patch(self, const Hole* hole, const Patch* patch, float* x, float* y, float* z) noexcept nogil:
+        # Fields of the changes of a patch at its own slots; there is space for `stride` of them.
+        cdef Index i
+        for i in range(patch.stride):
+            x[i] = y[i] = z[i] = 0.0
+        patch_field(patch.stride, patch.x, patch.y, patch.z, patch.n, patch.x, patch.y, patch.z, patch.change, x, y, z)
 
 
 cdef class PythonRule(FieldRule):

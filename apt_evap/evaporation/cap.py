@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apt_evap._common.small_matrices import lengths
 from apt_evap._common.sphere import fit_sphere
 from apt_evap._common.types import Floats
 from apt_evap._core.elementary import sine_and_cosine, total
+from apt_evap._core.sphere_sums import in_cone
 
 HALF_ANGLE = 45.0  # degrees from the axis: about what an instrument sees, and far from the shank
 FEWEST = 12  # surface atoms: three times the unknowns of the sphere
@@ -74,10 +74,8 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
     for _ in range(_ROUNDS):
         if len(chosen) < FEWEST:
             return NO_CAP
-        centre, radius = fit_sphere(positions[chosen])
-        above = np.flatnonzero(positions[:, 2] >= centre[2])
-        from_centre = positions[above] - centre
-        chosen = above[from_centre[:, 2] >= cosine * lengths(from_centre)]
+        centre, radius = fit_sphere(positions, chosen)
+        chosen = in_cone(positions, *centre, cosine)
     if len(chosen) < FEWEST:
         return NO_CAP
     fields = fields[chosen]

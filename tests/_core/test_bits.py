@@ -25,11 +25,11 @@ int main(void)
     static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
     static int list[N];
     int range[2] = {0, N};
-    static float columns[CELL * N];
+    static float columns[CELL * N], square[100 * N];
     float targets[3 * GROUP], sums[3 * GROUP] = {0}, bundle[3 * GROUP] = {0}, dot;
     double wide[3 * GROUP], wide_sums[3 * GROUP] = {0}, totals[100];
     static double multipoles[MULTIPOLE * N];
-    static float row_potential[N], zero[GROUP];
+    static float row_potential[N], zero[GROUP], cubes[N], change[N], inner[6][N];
     double potentials[GROUP] = {0}, zeros[GROUP] = {0};
     static float sum[N], product[N];
     double origin[3] = {5, 5, 12}, e[3] = {0};
@@ -51,8 +51,16 @@ int main(void)
     bundle_atoms(N - 3, N, columns, GROUP, targets, bundle);
     bundle_cells(N - 3, N, columns, GROUP, targets, bundle);
     weighted_sum(99, N / 100, x, y, 100, totals);
-    patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row);
-    patch_add(N, 0.3, row, sum);
+    group_charges_single(N, list, cells, q, origin, targets, sums);
+    group_charges_double(N, list, cells, q, origin, wide, wide_sums);
+    patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row, cubes);
+    for (int i = 0; i < 100 * N; i++)
+        square[i] = 0.02 * (drand48() - 0.5);
+    for (int i = 0; i < N; i++)
+        sum[i] = drand48();
+    row[1] = patch_iteration(100, N, square, sum, change);
+    patch_field_of_cubes(CELL, N, columns, fx, fy, fz, fq, inner[0], inner[1], inner[2]);
+    patch_field_of_inverse(CELL, N, columns, fx, fy, fz, fq, inner[3], inner[4], inner[5]);
     patch_product(CELL, N, columns, row, product);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
@@ -68,6 +76,7 @@ int main(void)
     add(potentials, sizeof potentials), add(row_potential, sizeof row_potential);
     add(sums, sizeof sums), add(wide_sums, sizeof wide_sums), add(e, sizeof e), add(row, sizeof row);
     add(sum, sizeof sum), add(product, sizeof product);
+    add(cubes, sizeof cubes), add(change, sizeof change), add(inner, sizeof inner);
     add(bundle, sizeof bundle), add(totals, 99 * sizeof totals[0]);
     add(&dot, sizeof dot), add(px, sizeof px), add(py, sizeof py), add(pz, sizeof pz);
     printf("%016llx %g\n", hash, e[0]);

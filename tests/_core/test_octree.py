@@ -91,6 +91,40 @@ def test_sweep_is_the_field_of_all_others(surface12, double):
     assert 1e-5 < rms(field[some] - expected, expected) < 1e-3  # as asked of the default; and cells were in use
 
 
+def test_changes_by_their_atoms(surface12, rng):
+    """Without cells: the field of changes of either sign, added once also where an atom pads its group."""
+    positions, _, charges = surface12
+    positions, changes = positions[:1003], rng.normal(size=1003)  # 31 groups and a part of one
+    tree = Octree(positions, charges[:1003])
+    field, before = np.zeros((2, 1003, 3)) + rng.normal(size=(1003, 3))
+    InteractionLists(tree, 0.0).add_changes(field, changes)
+    expected = twins.field(tree.positions, tree.positions, changes)
+    assert rms(field - before - expected, expected) < 2e-6  # rounding of float32, as of a sweep
+
+
+def test_changes_of_a_cell_are_a_charge_in_its_middle(rng):
+    clump, away = rng.random((32, 3)), np.array([30.0, 0.0, 0.0])
+    tree = Octree(np.concatenate([clump, clump + away]), np.ones(64), leaf_size=32)
+    changes = np.where(np.arange(64) < 32, 0.0, rng.normal(size=64))  # slots go by clump
+    field = np.zeros((64, 3))
+    InteractionLists(tree, 0.8).add_changes(field, changes)
+    middle = 0.5 * (tree.positions[32:].min(axis=0) + tree.positions[32:].max(axis=0))
+    expected = twins.field(tree.positions[:32], middle[None], changes.sum(keepdims=True))
+    assert rms(field[:32] - expected, expected) < 2e-6
+
+
+def test_changes_of_a_smooth_charge_are_those_of_a_sweep(surface12):
+    """Cells with a charge alone: the field of a smooth change within 5 %, which `Robin` relies on."""
+    positions, _, charges = surface12
+    tree = Octree(positions, charges)
+    changes = 0.01 * tree.positions[:, 2] * tree.charges
+    field = np.zeros((len(positions), 3))
+    InteractionLists(tree, 0.6).add_changes(field, changes)
+    some = slice(None, None, 8)
+    expected = twins.field(tree.positions[some], tree.positions, changes)
+    assert 1e-4 < rms(field[some] - expected, expected) < 0.05
+
+
 def test_sweep_over_a_cell_leaves_the_octupole(rng):
     """As for points: two clumps, each a group of targets, at a distance."""
     clump, distances, errors = rng.random((32, 3)), np.array([20.0, 40.0, 80.0]), []
