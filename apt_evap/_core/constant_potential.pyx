@@ -153,7 +153,7 @@ cdef class ConstantPotential(FieldRule):
         shape = gaussian_table(self.self_term * sqrt(M_PI / 2.0)) if self.gaussian else ()
         self.sums = Potentials(lists, *shape)
         angle = max(ROUGH_ANGLE, lists.opening_angle)
-        rough = Potentials(InteractionLists(tree, angle, n_threads, lists.disturbed), *shape)
+        rough = Potentials(lists.with_angle(angle, n_threads), *shape)
         charges, chosen = tree.charges.copy(), lists.slots
         image = self.multiply(self.sums, charges, double_precision, n_threads)
         if lists.disturbed is None:

@@ -21,8 +21,10 @@ cdef class InteractionLists:
     cdef Index middle_of(self, Octree tree, Index node) noexcept nogil
     cdef Index targets_of(self, Octree tree, Index node, int* slots, Index n) noexcept nogil
     cdef void split(self, Octree tree, int* slots, Index n, Index group) noexcept nogil
-    cdef void walk(self, Octree tree, Index group, double opening_angle, int* cells, int* ranges,
-                   Index* counts) noexcept nogil
+    cdef list_sources(self, Octree tree, int n_threads)
+    cdef int* kept_list(self, Octree tree, Index group, int* work) noexcept nogil
+    cdef void put_list(self, Octree tree, Index group, int* kept) noexcept nogil
+    cdef void walk(self, Octree tree, Index group, int* cells, int* ranges, Index* counts) noexcept nogil
     cdef void add_to_group(self, Octree tree, Index group, double[:, ::1] field, const double* changes,
                            const double* charge) noexcept nogil
     cdef void sweep_single(self, Octree tree, Index group, double[:, ::1] field) noexcept nogil

@@ -7,8 +7,10 @@ median splits within nodes of the octree. Measured: at equal error, a sweep over
 groups of 32 successive atoms in Morton order, which are wider because of the jumps of this order.
 """
 
-from cython.parallel cimport prange
+from cython.parallel cimport prange, threadid
 from libc.math cimport sqrt
+from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -87,7 +89,7 @@ cdef class InteractionLists:
 
     def __init__(self, Octree tree, double opening_angle, int n_threads=1, const signed char[::1] disturbed=None,
                  bint samples=False):
-        cdef Index node = 0, leaf, n = 0, group, chunk, n_chunks = 0, n_blocks = 0
+        cdef Index node = 0, leaf, n = 0, chunk, n_chunks = 0, n_blocks = 0
         cdef Index[::1] chunk_slot = np.zeros(tree.n_nodes + 1, np.int64)
         cdef Index[::1] chunk_group = np.zeros(tree.n_nodes + 1, np.int64)
         cdef int[::1] slots = np.empty(tree.n_slots, np.int32), targets
@@ -118,24 +120,64 @@ cdef class InteractionLists:
         self.n_groups = chunk_group[n_chunks]
         self.members = np.empty((self.n_groups, GROUP), np.int32)
         self.ball = np.empty((self.n_groups, 4))
-        self.starts = np.zeros((self.n_groups + 1, 3), np.int64)
         targets = slots[:n].copy()
         self.slots = np.asarray(slots)[:n]
         for chunk in prange(n_chunks, nogil=True, schedule="dynamic", chunksize=4, num_threads=n_threads):
             if chunk_slot[chunk] < chunk_slot[chunk + 1]:
                 self.split(tree, &targets[chunk_slot[chunk]], chunk_slot[chunk + 1] - chunk_slot[chunk],
                            chunk_group[chunk])
+        self.list_sources(tree, n_threads)
 
-        # lists of all groups in two passes: their lengths first, then the cells and ranges themselves
+    def with_angle(self, double opening_angle, int n_threads=1):
+        """Return lists of the same targets with another opening angle [rad]."""
+        cdef InteractionLists other = InteractionLists.__new__(InteractionLists)
+        other.tree, other.opening_angle, other.disturbed = self.tree, opening_angle, self.disturbed
+        other.slots, other.blocks, other.n_groups = self.slots, self.blocks, self.n_groups
+        other.members, other.ball = self.members, self.ball
+        other.list_sources(self.tree, n_threads)
+        return other
+
+    cdef list_sources(self, Octree tree, int n_threads):
+        # Lists of all groups: each is kept until the place of all is known.
+        cdef Index group, n_ranges = 2 * (tree.n_nodes + tree.n_slots - tree.n_sorted)
+        cdef int[:, ::1] work = np.empty((max(1, n_threads), tree.n_nodes + n_ranges), np.int32)
+        cdef int** kept = <int**>malloc(max(1, self.n_groups) * sizeof(int*))
+        if kept == NULL:
+            raise MemoryError
+        self.starts = np.zeros((self.n_groups + 1, 3), np.int64)
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
-            self.walk(tree, group, opening_angle, NULL, NULL, &self.starts[group + 1, 0])
+            kept[group] = self.kept_list(tree, group, &work[threadid(), 0])
         starts = np.cumsum(np.asarray(self.starts), axis=0)
         self.starts = starts
         self.cells = np.empty(max(1, starts[self.n_groups, 0]), np.int32)
         self.ranges = np.empty(max(1, 2 * starts[self.n_groups, 1]), np.int32)
         for group in prange(self.n_groups, nogil=True, schedule="dynamic", chunksize=16, num_threads=n_threads):
-            self.walk(tree, group, opening_angle, &self.cells[0] + self.starts[group, 0],
-                      &self.ranges[0] + 2 * self.starts[group, 1], NULL)
+            self.put_list(tree, group, kept[group])
+        free(kept)
+
+    cdef int* kept_list(self, Octree tree, Index group, int* work) noexcept nogil:
+        # Cells, then ranges of a group in memory of their own, and their numbers in `starts`; NULL if there is none.
+        cdef Index* counts = &self.starts[group + 1, 0]
+        cdef int* kept
+        self.walk(tree, group, work, work + tree.n_nodes, counts)
+        kept = <int*>malloc((counts[0] + 2 * counts[1]) * sizeof(int))
+        if kept != NULL:
+            memcpy(kept, work, counts[0] * sizeof(int))
+            memcpy(kept + counts[0], work + tree.n_nodes, 2 * counts[1] * sizeof(int))
+        return kept
+
+    cdef void put_list(self, Octree tree, Index group, int* kept) noexcept nogil:
+        cdef int* cells = &self.cells[0] + self.starts[group, 0]
+        cdef int* ranges = &self.ranges[0] + 2 * self.starts[group, 1]
+        cdef Index n_cells = self.starts[group + 1, 0] - self.starts[group, 0]
+        cdef Index n_ranges = self.starts[group + 1, 1] - self.starts[group, 1]
+        cdef Index[3] counts
+        if kept == NULL:   # there was no memory to keep it
+            self.walk(tree, group, cells, ranges, counts)
+        else:
+            memcpy(cells, kept, n_cells * sizeof(int))
+            memcpy(ranges, kept + n_cells, 2 * n_ranges * sizeof(int))
+            free(kept)
 
     cdef bint has_disturbed(self, Octree tree, Index node) noexcept nogil:
         # Whether a slot below a node is disturbed.
@@ -238,35 +280,29 @@ cdef class InteractionLists:
         self.split(tree, slots, half, group)
         self.split(tree, slots + half, n - half, group + left)
 
-    cdef void walk(self, Octree tree, Index group, double opening_angle, int* cells, int* ranges,
-                   Index* counts) noexcept nogil:
+    cdef void walk(self, Octree tree, Index group, int* cells, int* ranges, Index* counts) noexcept nogil:
         # Lists of one group: accepted cells, and slots [begin, end) of the leaves whose atoms are summed one by one,
-        # adjacent ranges merged; atoms added to a leaf later are ranges of one slot. Without lists it only counts
-        # cells, ranges and atoms.
+        # adjacent ranges merged; atoms added to a leaf later are ranges of one slot. Counts cells, ranges and atoms.
         cdef const double* ball = &self.ball[group, 0]
         cdef Index node = 0, n_cells = 0, n_ranges = 0, n_atoms = 0, open_end = -1, slot
-        cdef double dx, dy, dz, reach, factor = 2.0 / opening_angle if opening_angle > 0.0 else 1e30
+        cdef double dx, dy, dz, reach, factor = 2.0 / self.opening_angle if self.opening_angle > 0.0 else 1e30
         while node < tree.n_nodes:
             dx, dy, dz = ball[0] - tree.ball[node, 0], ball[1] - tree.ball[node, 1], ball[2] - tree.ball[node, 2]
             reach = tree.ball[node, 3] * factor + ball[3]
             if reach * reach < dx * dx + dy * dy + dz * dz and not tree.cancels[node]:
-                if cells != NULL:
-                    cells[n_cells] = <int>node
+                cells[n_cells] = <int>node
                 n_cells += 1
                 node = tree.skip[node]
             elif tree.skip[node] == node + 1:
                 if tree.first[node] != open_end:
-                    if ranges != NULL:
-                        ranges[2 * n_ranges] = tree.first[node]
+                    ranges[2 * n_ranges] = tree.first[node]
                     n_ranges += 1
                 open_end = tree.last[node]
-                if ranges != NULL:
-                    ranges[2 * n_ranges - 1] = <int>open_end
+                ranges[2 * n_ranges - 1] = <int>open_end
                 n_atoms += tree.last[node] - tree.first[node]
                 slot = tree.extra[node]
                 while slot >= 0:
-                    if ranges != NULL:
-                        ranges[2 * n_ranges], ranges[2 * n_ranges + 1] = <int>slot, <int>slot + 1
+                    ranges[2 * n_ranges], ranges[2 * n_ranges + 1] = <int>slot, <int>slot + 1
                     n_ranges += 1
                     n_atoms += 1
                     open_end = -1
@@ -274,8 +310,7 @@ cdef class InteractionLists:
                 node += 1
             else:
                 node += 1
-        if counts != NULL:
-            counts[0], counts[1], counts[2] = n_cells, n_ranges, n_atoms
+        counts[0], counts[1], counts[2] = n_cells, n_ranges, n_atoms
 
     def sweep(self, double[:, ::1] field, bint double_precision=False, int n_threads=1):
         """Field of all other atoms at each target, from the current charges of the tree.

@@ -204,7 +204,8 @@ cdef class Robin(FieldRule):
             # fields of the targets; those of all other atoms are scaled by the ratios of the samples
             before = self.sample_fields(normals, lists)
             if sweeps == 1 or double_precision or ROUGH_ERROR * residual > tolerance:
-                tree.refresh_all()
+                if sweeps > 1:
+                    tree.refresh_all()
                 lists.sweep(self.field, double_precision, n_threads)
             else:
                 lists.add_changes(self.field, tree.charges - charges, n_threads)

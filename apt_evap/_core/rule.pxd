@@ -11,8 +11,8 @@ from apt_evap._core.sources cimport Sources
 
 
 cdef struct Hole:
-    # The surroundings of an evaporated atom: slots whose fields are updated, first those of the patch in its order, then
-    # the near ones. Positions are relative to the hole; behind the patch, the arrays are padded to a multiple of
+    # The surroundings of an evaporated atom: slots whose fields are updated, first those of the patch in its order,
+    # then the near ones. Positions are relative to the hole; behind the patch, the arrays are padded to a multiple of
     # GROUP with distant positions.
     double x                # position of the evaporated atom [nm]
     double y
