@@ -91,6 +91,17 @@ def test_sweep_is_the_field_of_all_others(surface12, double):
     assert 1e-5 < rms(field[some] - expected, expected) < 1e-3  # as asked of the default; and cells were in use
 
 
+def test_lists_with_another_angle_are_those_made_with_it(surface12):
+    positions, _, charges = surface12
+    tree = Octree(positions, charges)
+    field, again = np.empty((2, len(positions), 3))
+    made, derived = InteractionLists(tree, 0.8), InteractionLists(tree, 0.4).with_angle(0.8)
+    made.sweep(field)
+    derived.sweep(again)
+    assert (field == again).all()
+    assert made.pairs == derived.pairs != InteractionLists(tree, 0.4).pairs
+
+
 def test_changes_by_their_atoms(surface12, rng):
     """Without cells: the field of changes of either sign, added once also where an atom pads its group."""
     positions, _, charges = surface12
