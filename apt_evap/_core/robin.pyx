@@ -231,7 +231,8 @@ cdef class Robin(FieldRule):
             mixed = np.maximum(self.mixed(maps, steps), 0.0)
             mixed *= total / elementary.total(mixed)
             at_slots[:] = mixed
-        tree.refresh_all()
+        if lists.disturbed is None:   # otherwise `scale` follows, which computes them
+            tree.refresh_all()
         return sweeps, residual
 
     cdef sample_fields(self, const double[:, ::1] normals, InteractionLists lists):
