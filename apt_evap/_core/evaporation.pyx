@@ -33,7 +33,7 @@ cdef extern from "random_numbers.h":
 cdef enum:
     NOT_RELAXED = 1 << 30   # number of events since the last relaxation before the first one
     FEW = 16384             # number of surface atoms up to which one thread is faster than several
-    INITIAL_CAPACITY = 4096   # slots within the update radius at first; 14 d_nn of fcc contain about 600
+    INITIAL_CAPACITY = 4096   # slots within the update radius at first; 18 d_nn of fcc contain about 1,000
     STATUS_DONE = 0
     STATUS_SWEEP_DUE = 1
     STATUS_EXHAUSTED = 2

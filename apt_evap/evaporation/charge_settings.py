@@ -34,9 +34,8 @@ class ChargeSettings:
         unit="d_nn",
     )
     update_radius: float = number(
-        "Fields are updated within this distance of a hole, at least `patch_radius`. Measured (R = 40 a): errors of "
-        "charges are those with 18.",
-        default=14.0,
+        "Fields are updated within this distance of a hole, at least `patch_radius`.",
+        default=18.0,
         above=0,
         at_most=40,
         unit="d_nn",
