@@ -382,11 +382,12 @@ def flight_errors(radii=(40, 80), shank=1.0, ions=300):
     return {"title": "flights alone, detector at 100 mm", "rows": rows}
 
 
-def bundle_errors(radii=(40, 80), shank=1.0, events=3000, ions=240, checked=90, repeats=5):
+def bundle_errors(radii=(40, 80), shank=1.0, events=5000, ions=240, checked=120, repeats=5):
     """Flights of the launches of responses, all of an ion together, and of one launch an ion; one thread.
 
     Places of five launches of some ions are compared with those of sums over all atoms and steps with an error of 1e-6.
     Two versions are compared by calls in turn with their folders in PYTHONPATH: events have the same bits.
+    The settings of the flights were chosen with the ions after other numbers of events.
     """
     rows, columns = [], np.array([0, 40, 62, 100, 139])
     for radius in radii:

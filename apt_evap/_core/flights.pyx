@@ -770,3 +770,34 @@ cdef class Flights:
                 self.n_pairs += near.n_atoms + near.n_cells
             for axis in range(3):
                 a[axis * width + k] = self.coulomb * one[axis]
+
+
+# The kernels of a step alone, for tests: rows of any lengths.
+
+def sum_of_rows(const double[::1] weights, const double[:, ::1] rows):
+    """Weighted sum of rows, shape (n,)."""
+    cdef double[::1] sums = np.empty(rows.shape[1])
+    weighted_sum(rows.shape[1], <int>rows.shape[0], &weights[0], &rows[0, 0], rows.shape[1], &sums[0])
+    return np.asarray(sums)
+
+
+def places_of_stage(double dt, double node, const double[::1] x, const double[::1] v, const double[::1] sums):
+    """Places x + dt (node v + dt sums), shape (n,)."""
+    cdef double[::1] places = np.empty(x.shape[0])
+    stage_places(x.shape[0], dt, node, &x[0], &v[0], &sums[0], &places[0])
+    return np.asarray(places)
+
+
+def ball_of_flights(const double[:, ::1] x, const double[:, ::1] v, const double[:, ::1] a, double begin, double end):
+    """Centre and radius of a ball around flights at two times, shape (4,); x, v and a have the shape (3, n)."""
+    cdef double[::1] ball = np.empty(4)
+    enclosing_ball(x.shape[1], &x[0, 0], &v[0, 0], &a[0, 0], begin, end, &ball[0])
+    return np.asarray(ball)
+
+
+def lengths_in_steps(double scale, double more, const double[:, ::1] sums, const double[:, ::1] p,
+                     const double[:, ::1] q):
+    """The ratios scale |sums| / (|p - q| + more), shape (n,), of vectors of the shape (3, n)."""
+    cdef double[::1] ratios = np.empty(p.shape[1])
+    relative_lengths(p.shape[1], scale, more, &sums[0, 0], &p[0, 0], &q[0, 0], &ratios[0])
+    return np.asarray(ratios)

@@ -123,11 +123,15 @@ APT_CLONES static void into_lanes(Index width, const double *restrict x, const d
     }
 }
 
+/* Back to double precision, with a factor, for n numbers, a multiple of SINGLE_LANES: with AVX-512 and any n, GCC 12
+ * rounds a constant factor to single precision for the last few numbers. */
 APT_CLONES static void out_of_lanes(Index n, double factor, const float *restrict lanes, double *restrict values)
 {
+    for (Index k = 0; k < n; k += SINGLE_LANES) {
 #pragma omp simd
-    for (Index k = 0; k < n; k++)
-        values[k] = factor * lanes[k];
+        for (int l = 0; l < SINGLE_LANES; l++)
+            values[k + l] = factor * lanes[k + l];
+    }
 }
 
 /* Centre and radius of a ball around all flights at two times of the step. */

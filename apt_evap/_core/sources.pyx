@@ -3,6 +3,8 @@
 from libc.math cimport sqrt
 from libc.stdlib cimport free, malloc, realloc
 
+import numpy as np
+
 from apt_evap._core.index cimport Index
 
 
@@ -163,3 +165,44 @@ cdef void single_field(const SingleSources* single, double px, double py, double
     field[0] = field[1] = field[2] = 0.0
     point_atoms_single(single.n_atoms, a, a + stride, a + 2 * stride, a + 3 * stride, x, y, z, field)
     point_cells_single(single.n_cells, stride, single.cells, x, y, z, field)
+
+
+cdef columns_of(const SingleSources* single):
+    # Copies of the columns of atoms and of cells, and the origin.
+    cdef Index k, m
+    cdef float[:, ::1] atoms = np.empty((4, single.n_atoms), np.float32)
+    cdef float[:, ::1] cells = np.empty((CELL, single.n_cells), np.float32)
+    for k in range(single.n_atoms):
+        for m in range(4):
+            atoms[m, k] = single.atoms[m * single.capacity + k]
+    for k in range(single.n_cells):
+        for m in range(CELL):
+            cells[m, k] = single.cells[m * single.capacity + k]
+    return np.asarray(atoms), np.asarray(cells), [single.origin[0], single.origin[1], single.origin[2]]
+
+
+def parted(float[:, ::1] atoms, float[:, ::1] cells, const double[::1] ball, const double[::1] origin):
+    """Sources in a ball relative to their origin, and the others; for tests.
+
+    Returns
+    -------
+    inside, outside : tuple
+        Columns of atoms (4, .) and of cells (CELL, .), and the origin.
+    """
+    cdef SingleSources single, inside, outside
+    cdef Index k, m
+    single.atoms = single.cells = inside.atoms = inside.cells = outside.atoms = outside.cells = NULL
+    single_reserve(&single, max(atoms.shape[1], cells.shape[1]), &origin[0])
+    for m in range(4):
+        for k in range(atoms.shape[1]):
+            single.atoms[m * single.capacity + k] = atoms[m, k]
+    for m in range(CELL):
+        for k in range(cells.shape[1]):
+            single.cells[m * single.capacity + k] = cells[m, k]
+    single.n_atoms, single.n_cells = atoms.shape[1], cells.shape[1]
+    single_part(&single, &ball[0], &inside, &outside)
+    result = columns_of(&inside), columns_of(&outside)
+    single_free(&single)
+    single_free(&inside)
+    single_free(&outside)
+    return result
