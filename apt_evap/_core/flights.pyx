@@ -78,7 +78,7 @@ cdef double SCOUT_TOLERANCE = 3e-2
 # are expanded. Measured on Ni[111], R = 80 a, 119 launches of an ion, 450 launches against direct sums: with 2.5 /
 # 2.75 / 3 / 3.5, places deviate by 0.56 / 0.43 / 0.36 / 0.32 um (median) and 2.7 / 1.4 / 1.2 / 1.0 um (largest), in
 # 1.02 / 1.14 / 1.21 / 1.40 ms an ion.
-cdef double FAR = 3.0
+cdef double FAR = 3.2
 cdef double SPLIT = 0.9
 
 # A flight alone has one list of sources for several steps: at the start for a ball of AT_START lengths, later for the

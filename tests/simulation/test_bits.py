@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "26e6f8d344476d728ab4d677f16039ed6277fb4e4bf07b6c8311128eb6c84c24"
+FINGERPRINT = "25d5ac1ca003901f357082cb3a3309adc09df0583aee9b888b21639280cd7a1c"
 PROGRAM = """
 import warnings
 
