@@ -87,7 +87,7 @@ def test_hyperbolas_of_a_bundle_whose_flights_end_in_different_steps(opening_ang
     assert len(np.unique(end[:, 6])) > 3  # some end earlier than others, and the rest go on without them
     assert flights.n_evaluations < 23 * (8 * flights.n_steps + 1)
     for launch in range(23):
-        # measured 6e-10; with expansions 1.0e-4, from a single charge that is 3 radii away
+        # measured 6e-10; with expansions 7.7e-5, from a single charge that is 3.2 radii away
         assert errors_against_hyperbola(end[launch], position=starts[launch], velocity=push[launch]).max() < bound
 
 
