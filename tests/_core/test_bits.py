@@ -25,15 +25,9 @@ int main(void)
     static float fx[N], fy[N], fz[N], fq[N], row[N], px[N], py[N], pz[N];
     static int list[N];
     int range[2] = {0, N};
-<<<<<<< HEAD
     static float columns[CELL * N], square[100 * N];
-    float targets[3 * GROUP], sums[3 * GROUP] = {0}, bundle[3 * GROUP] = {0}, dot;
-    double wide[3 * GROUP], wide_sums[3 * GROUP] = {0}, totals[100];
-=======
-    static float columns[CELL * N];
     float targets[3 * GROUP], sums[3 * GROUP] = {0}, bundle[3 * GROUP] = {0}, lanes[303], dot;
     double wide[3 * GROUP], wide_sums[3 * GROUP] = {0}, totals[100], step[302];
->>>>>>> 1752a31e (Flights of a bundle: twins of the kernels of a step, and their bits on every processor)
     static double multipoles[MULTIPOLE * N];
     static float row_potential[N], zero[GROUP], cubes[N], change[N], inner[6][N];
     double potentials[GROUP] = {0}, zeros[GROUP] = {0};
@@ -57,7 +51,11 @@ int main(void)
     bundle_atoms(N - 3, N, columns, GROUP, targets, bundle);
     bundle_cells(N - 3, N, columns, GROUP, targets, bundle);
     weighted_sum(99, N / 100, x, y, 100, totals);
-<<<<<<< HEAD
+    stage_places(101, 0.3, 0.7, x, y, z, step);
+    enclosing_ball(101, x, y, z, 0.1, 0.3, step + 101);
+    relative_lengths(101, 0.3, 0.1, x, y, z, step + 105);
+    into_lanes(101, x, origin, lanes), out_of_lanes(96, 0.3, lanes, step + 206);
+    add_polynomials(5, columns, targets, 0.3, GROUP, targets, bundle);
     group_charges_single(N, list, cells, q, origin, targets, sums);
     group_charges_double(N, list, cells, q, origin, wide, wide_sums);
     patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row, cubes);
@@ -68,15 +66,6 @@ int main(void)
     row[1] = patch_iteration(100, N, square, sum, change);
     patch_field_of_cubes(CELL, N, columns, fx, fy, fz, fq, inner[0], inner[1], inner[2]);
     patch_field_of_inverse(CELL, N, columns, fx, fy, fz, fq, inner[3], inner[4], inner[5]);
-=======
-    stage_places(101, 0.3, 0.7, x, y, z, step);
-    enclosing_ball(101, x, y, z, 0.1, 0.3, step + 101);
-    relative_lengths(101, 0.3, 0.1, x, y, z, step + 105);
-    into_lanes(101, x, origin, lanes), out_of_lanes(96, 0.3, lanes, step + 206);
-    add_polynomials(5, columns, targets, 0.3, GROUP, targets, bundle);
-    patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row);
-    patch_add(N, 0.3, row, sum);
->>>>>>> 1752a31e (Flights of a bundle: twins of the kernels of a step, and their bits on every processor)
     patch_product(CELL, N, columns, row, product);
     dot = patch_dot(N, row, fx);
     patch_field(N, fx, fy, fz, N - 1, fy, fz, fx, fq, px, py, pz);
