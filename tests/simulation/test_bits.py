@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.config.simulation_file import read_config
 
-FINGERPRINT = "25d5ac1ca003901f357082cb3a3309adc09df0583aee9b888b21639280cd7a1c"
+FINGERPRINT = "16ccf415bca87587c576f279d69d2d00ef0b06c13ffee01b3558b16724474175"
 PROGRAM = """
 import warnings
 
