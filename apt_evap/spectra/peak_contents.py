@@ -12,7 +12,7 @@ _SHORT, _LONG = 30 * BINS, 110 * BINS  # bins of a peak on both sides of its pla
 _TAILS = (0.0, 1.5, 2.5, 4.5, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
 _CORE = 0.75
 """Standard deviation of the normal distribution of a peak with a tail, over that of the left side, which has a part of
-the tail. Measured with four made peaks of 100,000 ions, three seeds, as the largest difference of the sums of ions: 3.2,
+the tail. Measured with four made peaks of 100,000 ions, three seeds, as the largest difference of sums of ions: 3.2,
 2.6, 2.0, 1.3, 0.9, 3.1 and 4.6 % of a peak for 0.5, 0.6, 0.7, 0.75, 0.8, 0.9 and 1. Compositions did not judge 0.8."""
 _LONGEST = 0.014  # of ln m/n at 30 Da: longer tails are not of one peak
 _TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
