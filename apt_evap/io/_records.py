@@ -288,7 +288,7 @@ def finite_rows(columns: Any, n: int) -> Any:
         if values is not None and dtype == "f4":
             with np.errstate(over="ignore"):
                 good = np.isfinite(values.astype(np.float32, copy=False))
-            for column in good.reshape(n, -1).T:  # faster than `all` along rows of three
+            for column in good.reshape(n, good.size // max(n, 1)).T:  # faster than `all` along rows of three
                 finite &= column
     return finite
 

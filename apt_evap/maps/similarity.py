@@ -158,8 +158,8 @@ def similarity(
     ...     second = run.hits(ae.RollUp(energy)).map(bins=40)
     ...     print(f"{energy} eV: {ae.similarity(first, second, smoothing=5.0):.2f}")
     0.2 eV: 1.00
-    0.3 eV: 0.96
-    0.5 eV: 0.85
+    0.3 eV: 0.95
+    0.5 eV: 0.86
     """
     smoothing = check_number(smoothing, "smoothing", at_least=0, unit="mm")
     data_range = check_number(data_range, "data_range", above=0)
