@@ -426,7 +426,9 @@ def test_the_verdict_takes_lines_about_the_pole(run20, emission, monkeypatch):
     """Maps of one crystal have the same symmetries, also if one of them has dark lines where the other's are bright."""
     run = replace(run20, perturbations=(), flown=())
     hits = run.hits(emission)
-    explorer = Explorer(run, ae.Hits(x=hits.x, y=hits.y).within_circle(100.0), ae.Registration(0.0, 1.0, (0.0, 0.0)))
+    inside = np.hypot(hits.x, hits.y) <= 100.0  # without a word on one that is far outside
+    measured = ae.Hits(x=hits.x[inside], y=hits.y[inside])
+    explorer = Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)))
     measures = []
 
     class Counted(PoleMeasure):
