@@ -204,6 +204,8 @@ class Twin:
         if earlier is None or not _ended_in_time(earlier, config.key):
             whole = earlier is not None and earlier.ended == StopReason.COMPLETE
             self._make_run(path, None if whole else self._seconds(ends_at, config.n_ions))
+        else:
+            self._note(f"{path} has the {len(earlier):,} ions of its time: nothing to do")
         told: list[str] = []
         if not (kept.has(REGISTRATION) and kept.has(ANSWER) and kept.has(_REPORT)):
             if not kept.has(REGISTRATION):

@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -55,6 +56,13 @@ class _Study:
         return ["the maps are alike"]
 
 
+class _Left(NamedTuple):
+    """In the place of a run that an earlier call has left; its length is that of the tuple."""
+
+    ended: str
+    provenance: dict
+
+
 @pytest.fixture
 def quick(tmp_path, monkeypatch, indexed_once):
     """The command with a simulation and a comparison that only write files; the calls of both are counted."""
@@ -83,7 +91,7 @@ def quick(tmp_path, monkeypatch, indexed_once):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(twin_of_map, "simulate", simulate)
     monkeypatch.setattr(twin_of_map, "compare", compare)
-    whole = SimpleNamespace(ended="", provenance={})
+    whole = _Left("", {})
     monkeypatch.setattr(twin_of_map, "load", lambda path: whole)  # the simulated run is in memory
     monkeypatch.setattr(twin_of_map, "is_run", lambda path: path.read_text() == "a run")
     monkeypatch.setattr(twin_of_map, "index", index)
@@ -154,7 +162,7 @@ def test_a_run_whose_time_was_over_is_not_continued_unless_it_is_another(quick, 
     quick.clear()
     key = read_config("t/specimen.toml").key
     for provenance, steps in (({"settings": key}, []), ({"settings": "of another file"}, ["run"]), ({}, ["run"])):
-        left = SimpleNamespace(ended=StopReason.TIME_OVER, provenance=provenance)
+        left = _Left(StopReason.TIME_OVER, provenance)
         monkeypatch.setattr(twin_of_map, "load", lambda path, left=left: left)
         assert main(["twin", *first]) == 0
         assert quick == steps
