@@ -28,8 +28,8 @@ cdef extern from "kernels.h":
 ROUGH_ERROR = 0.05
 """Error of the field of changes of the charges by `add_changes` over that field, at most.
 
-Measured (Ni[111], R = 40 a, four places of a run): the errors of the charges after a relaxation are the same to two digits
-with sweeps instead, which take 1.7 times as long.
+Measured (Ni[111], R = 40 a, four places of a run): the errors of the charges after a relaxation are the same to two
+digits with sweeps instead, which take 1.7 times as long.
 """
 
 OUTLIER = 4.0
