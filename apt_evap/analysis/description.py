@@ -380,8 +380,9 @@ def _widen(extent, values):
 
 def _extent(values):
     """Smallest and largest finite value, None if there is none."""
-    finite = values[np.isfinite(values)]
-    return [_plain(finite.min()), _plain(finite.max())] if len(finite) else None
+    extent: list[Any] = []
+    _widen(extent, values)
+    return [_plain(end) for end in extent] or None
 
 
 def _plain(value):

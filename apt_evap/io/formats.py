@@ -288,7 +288,8 @@ def _warn_of_size(path, content):
     And of positions that are nearer to each other than atoms are.
     """
     if isinstance(content, Hits) and content.outcome is None and content.positions is not None:
-        span = _span(content.positions)
+        span = _span(content.positions[:_ENOUGH])  # of most files, these are far enough apart
+        span = _span(content.positions) if span < _ATOM else span
         if 0 < span < _ATOM and len(content) >= _ENOUGH:
             warn(
                 f"{str(path)!r} has positions within {span:.2g} nm, less than the size of an atom: are they in nm?",

@@ -234,6 +234,14 @@ def test_selection_recounts_the_ions_per_pulse(tmp_path):
     assert again.multiplicity.tolist() == [1, 2, 2, 1] and again.x.tolist() == [0, 2, 3, 5]
 
 
+@pytest.mark.parametrize(("scale", "ions", "warned"), [(1e-9, 200, True), (1.0, 200, False), (1e-9, 50, False)])
+def test_positions_in_metres_are_noticed(tmp_path, recwarn, rng, scale, ions, warned):
+    positions = scale * rng.uniform(0, 30, (ions, 3))  # nm, as metres
+    write(tmp_path / "a.pos", Hits(positions=positions, mass_to_charge=np.full(ions, 27.0)))
+    read(tmp_path / "a.pos")
+    assert any("are they in nm?" in str(warning.message) for warning in recwarn) == warned
+
+
 @pytest.mark.parametrize("suffix", [".pos", ".epos"])
 def test_missed_and_broken_ions_are_left_out_and_counted(tmp_path, suffix):
     hits = Hits(
