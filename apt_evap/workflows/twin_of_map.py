@@ -60,9 +60,9 @@ _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
 _HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
 _BINS = 128  # of a map of ions
-# The fit takes _FIT processor seconds, and for each draw per ion _FIT_PER_DRAW of the time of the simulation. Measured in
-# one case: nickel, R = 11 nm, 38,150 ions, 8 draws, 88 s of one thread: the fit takes 108 s, 45 s of them whatever the ions
-# are. With it 3 minutes of nickel took 181 s on two cores, those of tungsten 236 s.
+# The fit takes _FIT processor seconds, and for each draw per ion _FIT_PER_DRAW of the time of the simulation. Measured
+# in one case, nickel, R = 11 nm, 38,150 ions, 8 draws, 88 s of one thread: the fit takes 108 s, 45 s of them whatever
+# the ions are. With it 3 minutes of nickel took 181 s on two cores, those of tungsten 236 s.
 _FIT, _FIT_PER_DRAW = 45.0, 0.09
 _LEAST_PART = 0.2  # of the time is for the simulation, however long the fit takes
 _SPARE = 4.0  # times the ions that the estimate allows are asked for, because the clock ends the run
