@@ -1,7 +1,7 @@
 """Noise-corrected similarity of simulated maps with a measured one.
 
-The comparison equals that of `DetectorMap.flattened` and `similarity`, for stacks of maps. A stack is flattened by the
-broad density of its first map; the other maps are resamples of the first.
+The comparison equals that of `DetectorMap.flattened` and `similarity`. Maps of noise are flattened by the broad density
+of the map that they belong to.
 
 Noise adds variance, which the structural similarity interprets as contrast. With variances s² of the signals and n² of
 the noise, a simulated signal with c times the contrast has a similarity of about 2 c s² / (c² s² + s² + n²), with its
@@ -18,10 +18,18 @@ import numpy as np
 import scipy
 
 from apt_evap._common.types import Floats, Integers
-from apt_evap.detection.detector_map import DetectorMap, check_sigma, masked_gaussian
+from apt_evap.detection.detector_map import DetectorMap, check_sigma, gaussian, masked_gaussian
 from apt_evap.fit.fit_settings import FitSettings
-from apt_evap.fit.resampling import NOISE
-from apt_evap.maps.similarity import WINDOW, local_moments, local_similarity, window_fits, window_mean
+from apt_evap.fit.resampling import DrawnMap
+from apt_evap.maps.similarity import (
+    WINDOW,
+    Moments,
+    local_moments,
+    local_similarity,
+    similarity_gradients,
+    window_fits,
+    window_mean,
+)
 
 _FEWEST_CELLS = 50
 NOISE_MAPS = 50
@@ -29,7 +37,7 @@ NOISE_MAPS = 50
 
 
 class Comparison:
-    """Structural similarity with a measured map, with resamples if it contains counts.
+    """Structural similarity with a measured map, with resamples of its counts.
 
     Parameters
     ----------
@@ -60,31 +68,111 @@ class Comparison:
         self.mask, self.inside = measured.mask[self.box], inside[self.box]
         sizes = np.array(measured.bin_size[::-1])
         self._smoothing, self._flattening = settings.smoothing / sizes, settings.flattening / sizes
-        values = measured.values[self.box]
-        self.measured = values[None].astype(float)
+        self._extent = gaussian(self.mask.astype(float), self._smoothing)  # of the smoothed mask, for an adjoint
+        self.measured = measured.values[self.box].astype(float)
         self.measured_noise: Floats | float = 0.0
         """Variance of the measured noise in a window, shape (ny, nx)."""
+        self._noise = None  # of the resamples, within the mask
         if measured.is_counts:
             number = max(settings.resamples, NOISE_MAPS) if settings.allow_noise else settings.resamples
             random = np.random.default_rng((settings.seed, 0))
+            values = measured.values[self.box]
             noise = random.poisson(values, (number, *values.shape)) - values
             if settings.allow_noise:
                 self.measured_noise = self.variance_of(noise, self.measured)
-            self.measured = np.concatenate([self.measured, values + NOISE * noise[: settings.resamples]])
-        self._measured = self._moments(self.densities(self.measured))
+            self._noise = noise[: settings.resamples, self.mask].astype(float)
+        self._measured = self._moments(self.densities(self.measured[None]))
 
     def densities(self, maps: Floats) -> Floats:
         """Densities for the comparison: flattened, smoothed, relative to their mean; shape (k, ny, nx)."""
-        maps = self._smoothed(maps)
+        maps = self._smoothed(maps, self._broad(maps[0]))
         mean = maps[:, self.mask].mean(axis=1)[:, None, None]
         return np.where(self.mask, np.divide(maps, mean, out=np.zeros_like(maps), where=mean > 0), 1.0)
 
     def variance_of(self, noise: Floats, map: Floats) -> Floats:
-        """Variance in a window from noise, shape (k, ny, nx), in the densities of a map, shape (1, ny, nx)."""
-        first, *smoothed = self._smoothed(np.concatenate([map, noise]))
+        """Variance in a window from noise, shape (k, ny, nx), in the densities of a map, shape (ny, nx)."""
+        first, *smoothed = self._smoothed(np.concatenate([map[None], noise]), self._broad(map))
         mean = first[self.mask].mean()
         densities = np.divide(smoothed, mean, out=np.zeros_like(smoothed), where=mean > 0)
         return self._variance(densities).mean(axis=0)
+
+    def _broad(self, map):
+        """Broad density of a map, which flattens it; 1 without flattening."""
+        map = np.where(self.mask, map, 0.0)
+        return masked_gaussian(map, self.mask, self._flattening) if self._flattening.any() else np.ones_like(map)
+
+    def _smoothed(self, maps, broad):
+        maps = np.where(self.mask, maps, 0.0)
+        maps = np.divide(maps, broad, out=np.zeros_like(maps), where=broad > 0)
+        return masked_gaussian(maps, self.mask, self._smoothing) if self._smoothing.any() else maps
+
+    def _by_counts(self, gradient, counts):
+        """Derivatives with respect to the counts of a map from those with respect to its densities.
+
+        The adjoint of `densities` for a constant broad density: of the mean, of the smoothing, of the flattening.
+        """
+        broad = self._broad(counts)
+        smoothed = self._smoothed(counts[None], broad)[0]
+        mean, inside = smoothed[self.mask].mean(), np.where(self.mask, gradient, 0.0)
+        if not mean > 0:
+            return np.zeros_like(inside)
+        along = (inside * smoothed).sum() / (mean * np.count_nonzero(self.mask))
+        by_smoothed = np.where(self.mask, (inside - along) / mean, 0.0)
+        if self._smoothing.any():
+            by_smoothed = np.divide(by_smoothed, self._extent, out=np.zeros_like(inside), where=self.mask)
+            by_smoothed = np.where(self.mask, gaussian(by_smoothed, self._smoothing), 0.0)
+        return np.divide(by_smoothed, broad, out=np.zeros_like(inside), where=broad > 0)
+
+    def similarity(self, counts: Floats, noise: Floats | None = None, *, plain: bool = False) -> float:
+        """Similarity of a map of the box with the measured map.
+
+        Parameters
+        ----------
+        counts, noise : ndarray, shape (ny, nx)
+            As those of a `DrawnMap`.
+        plain : bool
+            Whether to omit the noise correction.
+        """
+        moments = self._moments(self.densities(counts[None]))
+        return float(self._mean_similarity(moments, self._measured, self._correction(counts, noise, plain))[0])
+
+    def similarities(self, map: DrawnMap, *, plain: bool = False) -> Floats:
+        """Similarity of a drawn map and those of all resamples, shape (1 + resamples,).
+
+        Those of the resamples are to first order in the noise of the run and of the measured counts, with that of the
+        map as their mean.
+
+        Parameters
+        ----------
+        map : DrawnMap
+            Result of `Sampler.map`.
+        plain : bool
+            Whether to omit the noise correction.
+        """
+        correction = self._correction(map.counts, map.noise, plain)
+        moments = self._moments(self.densities(map.counts[None]))
+        value = self._mean_similarity(moments, self._measured, correction)
+        if not self.settings.resamples:
+            return value
+        simulated, measured = self._gradients(moments, self._measured, correction)
+        changes = map.changes(self._by_counts(simulated, map.counts))
+        if self._noise is not None:
+            changes += np.einsum("rb,b->r", self._noise, self._by_counts(measured, self.measured)[self.mask])
+        return np.concatenate([value, value + (changes - changes.mean())])
+
+    def _correction(self, counts, noise, plain):
+        """Variance of the noise of both maps in a window; 0 without a correction."""
+        if plain or not self.settings.allow_noise:
+            return 0.0
+        return self.measured_noise + (0.0 if noise is None else self.variance_of(noise[None], counts))
+
+    def ceiling(self, divisions: int, seed: tuple[int, int]) -> Floats:
+        """Uncorrected similarities of random halves of the measured counts, shape (divisions,)."""
+        random = np.random.default_rng(seed)
+        counts = self.measured.astype(np.int64)
+        half = random.binomial(counts, 0.5, (divisions, *counts.shape)).astype(float)
+        first, second = (self._moments(self.densities(part)) for part in (half, counts - half))
+        return self._mean_similarity(first, second)
 
     def _variance(self, densities):
         return window_mean(densities**2) - window_mean(densities) ** 2
@@ -92,44 +180,15 @@ class Comparison:
     def _moments(self, densities):
         return local_moments(densities)
 
-    def _smoothed(self, maps):
-        maps = np.where(self.mask, maps, 0.0)
-        if self._flattening.any():
-            broad = masked_gaussian(maps[:1], self.mask, self._flattening)
-            maps = np.divide(maps, broad, out=np.zeros_like(maps), where=broad > 0)
-        return masked_gaussian(maps, self.mask, self._smoothing) if self._smoothing.any() else maps
-
-    def similarities(self, maps: Floats, noise: Floats | None = None, *, plain: bool = False) -> Floats:
-        """Similarities of a map of the box and of its resamples with the measured map and its resamples, shape (k,).
-
-        The similarities of the resamples are scaled to the full noise of the ions, with the first one as their mean.
-
-        Parameters
-        ----------
-        maps, noise : ndarray
-            Result of `Sampler.maps`.
-        plain : bool
-            Whether to omit the noise correction.
-        """
-        correction = 0.0
-        if self.settings.allow_noise and not plain:
-            correction = self.measured_noise + (0.0 if noise is None else self.variance_of(noise[None], maps[:1]))
-        values = self._mean_similarity(self._moments(self.densities(maps)), self._measured, correction)
-        if len(values) > 1:
-            values[1:] = values[0] + (values[1:] - values[1:].mean()) / NOISE
-        return values
-
-    def ceiling(self, divisions: int, seed: tuple[int, int]) -> Floats:
-        """Uncorrected similarities of random halves of the measured counts, shape (divisions,)."""
-        random = np.random.default_rng(seed)
-        counts = self.measured[0].astype(np.int64)
-        half = random.binomial(counts, 0.5, (divisions, *counts.shape)).astype(float)
-        first, second = (self._moments(self.densities(part)) for part in (half, counts - half))
-        return self._mean_similarity(first, second)
-
     def _mean_similarity(self, first, second, noise=0.0):
         local = local_similarity(first, second, self.settings.data_range, noise)
         return local[:, self.inside].mean(axis=1)
+
+    def _gradients(self, first, second, noise):
+        """Derivatives of the mean similarity of two maps with respect to their densities."""
+        weights = self.inside / np.count_nonzero(self.inside)
+        one, other = (Moments(*(part[0] for part in moments)) for moments in (first, second))
+        return similarity_gradients(one, other, self.settings.data_range, noise, weights)
 
 
 class FoldedComparison(Comparison):
@@ -176,8 +235,15 @@ class FoldedComparison(Comparison):
         return self._moments(densities)[1]
 
     def _mean_similarity(self, first, second, noise=0.0):
-        (x, first_values), (y, other) = first, second
-        return (2 * self._weights @ (x * y) + noise) / (first_values + other)
+        (x, first_variance), (y, second_variance) = first, second
+        return (2 * self._weights @ (x * y) + noise) / (first_variance + second_variance)
+
+    def _gradients(self, first, second, noise):
+        value, variances = self._mean_similarity(first, second, noise), first[1] + second[1]
+        (x, _), (y, _) = first, second
+        # the sums of both over all cells are 0, as they must be for folded densities less their mean
+        by_folded = (2 * self._weights[:, None] * (other - value * own) / variances for own, other in ((x, y), (y, x)))
+        return tuple((self._fold.T @ gradient).reshape(self.mask.shape) for gradient in by_folded)
 
 
 def _box(mask):

@@ -107,7 +107,7 @@ class EnergySearch:
 
         def dissimilarity(steps):
             counts = DetectorMap.from_hits(moved(steps).hits(hits), like=region, position_step=None).counts
-            return -comparison.similarities(counts[comparison.box][None])[0]
+            return -comparison.similarity(counts[comparison.box])
 
         simplex = np.vstack([np.zeros(4), np.eye(4)])
         options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 1e-5, "maxfev": 200}
@@ -140,9 +140,9 @@ class EnergySearch:
 
             def scores(perturbation):
                 number = draws or self._draws(perturbation)
-                maps, noise = self.sampler.maps(perturbation, number)
-                structure = None if measure is None else self._structure(maps[0], number, measure)
-                similarities = self.comparison.similarities(maps, noise)
+                drawn = self.sampler.map(perturbation, number)
+                structure = None if measure is None else self._structure(drawn.counts, number, measure)
+                similarities = self.comparison.similarities(drawn)
                 bar.update()
                 return similarities, structure
 
@@ -199,10 +199,10 @@ class EnergySearch:
 
     def map_and_scores(self, perturbation: Any) -> tuple[DetectorMap, Floats, Floats]:
         """Simulated map on the measured bins, its corrected and uncorrected similarities, each (1 + resamples,)."""
-        maps, noise = self.sampler.maps(perturbation, self._draws(perturbation))
-        simulated = self._simulated(maps[0], f"simulation, {perturbation!r}")
+        drawn = self.sampler.map(perturbation, self._draws(perturbation))
+        simulated = self._simulated(drawn.counts, f"simulation, {perturbation!r}")
         similarities = self.comparison.similarities
-        return simulated, similarities(maps, noise), similarities(maps, noise, plain=True)
+        return simulated, similarities(drawn), similarities(drawn, plain=True)
 
     def ceiling(self) -> Score | None:
         """Similarity of two halves of the measured ions, None for densities."""

@@ -1,35 +1,61 @@
 """Resampled maps of a run, for the statistical errors from the noise of its ions.
 
-Resamples with the full noise would have twice the noise of the maps, and favour other energies. So they have a tenth of
-the noise, and their deviations are multiplied by ten: first order in the noise (infinitesimal jackknife of B. Efron,
-J. R. Statist. Soc. B 54, 83 (1992)).
+Resamples with the full noise would have twice the noise of the maps, and favour other energies. So what they change is
+taken to first order in the noise (infinitesimal jackknife of B. Efron, J. R. Statist. Soc. B 54, 83 (1992)): the
+derivative of a score with respect to the counts of the bins, times the noise of each resample.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy
 
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run
 
-NOISE = 0.1
-"""Noise of a resample, relative to that of the ions."""
 GROUPS = 1 << 16
 """Largest number of ions with separate weights. Measured: with 256 groups of ions, errors were 20 % too large."""
 
 
-class Sampler:
-    """Maps of a run in the measured frame, for all its ions and for resamples of them.
+@dataclass(frozen=True, eq=False, repr=False)
+class DrawnMap:
+    """Map of the draws of a run in the measured frame.
 
-    In a resample the weight of an ion is 1 plus a tenth of the deviation of a Poisson number of mean 1 from its mean.
-    The weight is the same for all perturbations and draws of an ion: resamples are paired. With more than `GROUPS`
-    ions, some ions have common weights.
+    Parameters
+    ----------
+    counts : ndarray, shape (ny, nx)
+        Hits per bin, summed over the draws.
+    noise : ndarray or None, shape (ny, nx)
+        Sum of the draws with weights of sum 0 and mean square 1: it has the same noise as the sum of the draws, but no
+        signal. None for a single draw.
+    cells, groups : ndarray of int, shape (n,)
+        Bin of each hit, and the row of its ion in `weights`.
+    weights : ndarray of float32, shape (groups, resamples)
+        What each resample changes of the weight of an ion.
+    """
+
+    counts: Floats
+    noise: Floats | None
+    cells: Integers
+    groups: Integers
+    weights: np.ndarray
+
+    def changes(self, gradient: Floats) -> Floats:
+        """Change of a score in each resample, shape (resamples,), from its derivatives with respect to `counts`."""
+        of_groups = np.bincount(self.groups, gradient.ravel()[self.cells], minlength=len(self.weights))
+        return np.einsum("g,gr->r", of_groups, self.weights)
+
+
+class Sampler:
+    """Maps of a run in the measured frame, with resamples of its ions.
+
+    A resample changes the weight of an ion, 1, by the deviation of a Poisson number of mean 1 from its mean. It is the
+    same for all perturbations and draws of an ion: resamples are paired. With more than `GROUPS` ions, some ions have
+    common weights.
 
     Parameters
     ----------
@@ -56,7 +82,7 @@ class Sampler:
         resamples: int,
         seed: Any,
     ) -> None:
-        self.run, self.registration, self.resamples = run, registration, resamples
+        self.run, self.registration = run, registration
         random = np.random.default_rng(seed)
         self._edges = [
             edges[part.start : part.stop + 1]
@@ -65,11 +91,10 @@ class Sampler:
         self.shape = tuple(len(edges) - 1 for edges in self._edges)
         self._groups = random.permutation(len(run)) % GROUPS
         shape = self._groups.max() + 1, resamples
-        weights = 1 + NOISE * (random.poisson(1.0, shape) - 1)
-        self._weights = np.concatenate([np.ones((shape[0], 1)), weights], axis=1, dtype=np.float32)
+        self._weights = (random.poisson(1.0, shape) - 1).astype(np.float32)
 
-    def maps(self, perturbation: Perturbation, number: int) -> tuple[Floats, Floats | None]:
-        """Hits per bin of all ions and of each resample, and the noise of the draws.
+    def map(self, perturbation: Perturbation, number: int) -> DrawnMap:
+        """Hits per bin of all ions.
 
         Parameters
         ----------
@@ -80,11 +105,7 @@ class Sampler:
 
         Returns
         -------
-        maps : ndarray
-            Shape (1 + resamples, ny, nx).
-        noise : ndarray or None
-            Sum of the draws with weights of sum 0 and mean square 1: it has the same noise as the sum of the draws, but
-            no signal; shape (ny, nx). None for a single draw.
+        DrawnMap
         """
         size = int(np.prod(self.shape))
         draws = [self._cells(perturbation, draw) for draw in range(number)]
@@ -95,11 +116,8 @@ class Sampler:
             counts = (np.bincount(cells, minlength=size) for cells, _ in draws)
             noise = sum(w * count for w, count in zip(weights, counts, strict=True)).reshape(self.shape)
         cells, ions = (np.concatenate(parts) for parts in zip(*draws, strict=True))
-        if not self.resamples:
-            return np.bincount(cells, minlength=size).reshape(1, *self.shape).astype(float), noise
-        ones = np.ones(len(cells), np.float32)
-        table = scipy.sparse.coo_array((ones, (cells, self._groups[ions])), (size, len(self._weights))).tocsr()
-        return (table @ self._weights).T.reshape(-1, *self.shape).astype(float), noise
+        counts = np.bincount(cells, minlength=size).reshape(self.shape).astype(float)
+        return DrawnMap(counts, noise, cells, self._groups[ions], self._weights)
 
     def _cells(self, perturbation, draw):
         """Bins and indices of the ions within the box."""

@@ -76,6 +76,42 @@ def local_similarity(first: Moments, second: Moments, data_range: float, noise: 
     return local / ((first.mean**2 + second.mean**2 + c1) * (first.variance + second.variance + c2))
 
 
+def similarity_gradients(
+    first: Moments, second: Moments, data_range: float, noise: float | Floats, weights: Floats
+) -> tuple[Floats, Floats]:
+    """Derivatives of a weighted sum of `local_similarity` with respect to the densities of either map.
+
+    Parameters
+    ----------
+    first, second, data_range, noise
+        As for `local_similarity`, of two maps.
+    weights : ndarray, shape (ny, nx)
+        Weights of the bins.
+
+    Returns
+    -------
+    tuple of two ndarray, shape (ny, nx)
+    """
+    c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
+    product = first.mean * second.mean
+    covariance = window_mean(first.density * second.density) - product
+    means, structure = 2 * product + c1, 2 * covariance + noise + c2
+    squares = first.mean**2 + second.mean**2 + c1
+    variances = first.variance + second.variance + c2
+    # with respect to the window means of x y and of x^2, and to the means themselves; a window is symmetric
+    by_product = weights * 2 * means / (squares * variances)
+    by_square = -weights * means * structure / (squares * variances**2)
+    of_product, of_square = window_mean(by_product), window_mean(by_square)
+    by_means = weights * 2 * structure / (squares * variances) - by_product
+    by_own = -weights * 2 * means * structure / (squares**2 * variances) - 2 * by_square
+
+    def gradient(own, other):
+        by_mean = window_mean(by_means * other.mean + by_own * own.mean)
+        return by_mean + 2 * own.density * of_square + other.density * of_product
+
+    return gradient(first, second), gradient(second, first)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Similarity(float):
     """Structural similarity of two maps, a float with the parameters of the comparison.

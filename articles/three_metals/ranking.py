@@ -99,7 +99,7 @@ def scores(target, candidates, orientation, projection, metal):
         plain = float(ae.similarity(map, target, smoothing=smoothing))
         noise_free = np.nan
         if corrected is not None:
-            noise_free = float(corrected.similarities(map.values[corrected.box][None].astype(float))[0])
+            noise_free = corrected.similarity(map.values[corrected.box].astype(float))
         each = folded(map, orientation, projection, metal)
         found.append((plain, noise_free, each.correlation(reference), concordance(each, reference)))
     return np.array(found)

@@ -35,7 +35,7 @@ def cells_of(map):
 def concordance(simulated, measured, settings=SETTINGS):
     """Of two maps; of counts, with the correction for the noise of the measured one."""
     comparison = FoldedComparison(measured, settings, cells_of(measured))
-    return comparison.similarities(simulated.values[comparison.box][None].astype(float))[0]
+    return comparison.similarity(simulated.values[comparison.box].astype(float))
 
 
 def test_symmetric_places_have_one_cell():

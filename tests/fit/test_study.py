@@ -13,16 +13,17 @@ from scipy.stats import truncnorm
 import apt_evap as ae
 from apt_evap._common.codec import declared, to_plain
 from apt_evap.emission.perturbations import Combined, launch_tangentially
-from apt_evap.fit.comparison import Comparison
+from apt_evap.fit.comparison import Comparison, FoldedComparison
 from apt_evap.fit.energy_search import EnergySearch
 from apt_evap.fit.fit_energies import real_units_of
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.fit.intervals import intervals
-from apt_evap.fit.resampling import NOISE, Sampler
+from apt_evap.fit.resampling import Sampler
 from apt_evap.fit.structure import PoleMeasure
 from apt_evap.fit.study import Score
 from apt_evap.maps.pole_frame import pole_frame
+from apt_evap.maps.similarity import local_moments, local_similarity
 from apt_evap.simulation.history import CapHistory
 
 EDGES = np.linspace(-60, 60, 49)
@@ -365,12 +366,12 @@ def test_what_is_compared_is_what_similarity_compares(run, redrawn, smoothing, f
     comparison = Comparison(measured, FitSettings(smoothing=smoothing, flattening=flattening, resamples=0))
     sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
     simulated = replace(seen(run, LATERAL), mask=measured.mask)
-    maps, noise = sampler.maps(LATERAL, 1)
-    assert noise is None
-    assert np.array_equal(maps[0], simulated.counts[comparison.box])
+    drawn = sampler.map(LATERAL, 1)
+    assert drawn.noise is None
+    assert np.array_equal(drawn.counts, simulated.counts[comparison.box])
     flat = [each.flattened(flattening) for each in (measured, simulated)]
     # the same sums in another order
-    assert comparison.similarities(maps, plain=True)[0] == pytest.approx(
+    assert comparison.similarity(drawn.counts, plain=True) == pytest.approx(
         float(ae.similarity(*flat, smoothing=smoothing)), abs=1e-12
     )
 
@@ -398,15 +399,15 @@ def test_errors_of_measured_maps_are_those_of_new_measurements(run, other):
     """The error told from one measured map, against the scatter of 200 that are truly independent."""
     random = np.random.default_rng(4)
     truth = seen(other, ROLLUP).smoothed(2.5)
-    simulated = run.hits(ROLLUP)
     frame = ae.DetectorMap.from_array(np.ones((48, 48), int), EDGES, EDGES, is_counts=True)
-    counts = ae.DetectorMap.from_hits(simulated, like=frame).counts.astype(float)
+    drawn = Sampler(run, HERE, frame, (slice(0, 48), slice(0, 48)), 300, 0).map(ROLLUP, 1)
+    drawn = replace(drawn, weights=np.zeros_like(drawn.weights))  # the ions of the run stay as they are
     values, errors = [], []
     for seed in range(200):
         measured = replace(frame, values=random.poisson(3 * truth.values))
         resamples = 300 if seed < 6 else 0
         comparison = Comparison(measured, FitSettings(smoothing=2.5, flattening=0.0, resamples=resamples, seed=seed))
-        found = comparison.similarities(np.repeat(counts[None], resamples + 1, axis=0))
+        found = comparison.similarities(drawn)
         values.append(found[0])
         if resamples:
             errors.append(found[1:].std(ddof=1))
@@ -420,16 +421,59 @@ def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
     """In every bin as many ions as Poisson's distribution says, and bins independent of each other."""
     measured = seen(other, ROLLUP)
     sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 400, 7)
-    maps, _ = sampler.maps(ROLLUP, 1)
-    noise = (maps[1:] - maps[0]) / NOISE
-    assert np.array_equal(maps[0], seen(run, ROLLUP).counts)
+    drawn, every = sampler.map(ROLLUP, 1), np.eye(48 * 48)
+    noise = np.array([drawn.changes(bin) for bin in every])  # of the counts themselves
+    assert np.array_equal(drawn.counts, seen(run, ROLLUP).counts)
     # mean over 2,304 bins of a variance from 400 resamples: 7 % / sqrt(2304), and of 4-th moments as much
-    assert noise.var(axis=0).sum() == pytest.approx(maps[0].sum(), rel=0.01)
-    assert noise.sum(axis=(1, 2)).var() == pytest.approx(maps[0].sum(), rel=3 * np.sqrt(2 / 400))
+    assert noise.var(axis=1).sum() == pytest.approx(drawn.counts.sum(), rel=0.01)
+    assert noise.sum(axis=0).var() == pytest.approx(drawn.counts.sum(), rel=3 * np.sqrt(2 / 400))
     # replicas of an ion are one ion: nothing is gained for the errors of the run by drawing often
-    twice, _ = sampler.maps(ROLLUP, 2)
-    together = (twice.sum(axis=(1, 2))[1:] - twice[0].sum()) / NOISE / 2
-    assert together.std() == pytest.approx(noise.sum(axis=(1, 2)).std(), rel=0.05)
+    together = sampler.map(ROLLUP, 2).changes(np.full((48, 48), 0.5))
+    assert together.std() == pytest.approx(noise.sum(axis=0).std(), rel=0.05)
+
+
+@pytest.mark.parametrize(("smoothing", "flattening"), [(0.0, 0.0), (2.5, 15.0)])
+@pytest.mark.parametrize("folded", [False, True])
+def test_resamples_are_maps_with_a_little_noise(run, other, smoothing, flattening, folded):
+    """A slow twin: a map for each resample, of which the flattening and the correction stay those of the whole map."""
+    x, y = np.meshgrid(EDGES[1:], EDGES[1:])
+    measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
+    settings = FitSettings(smoothing=smoothing, flattening=flattening, resamples=5, seed=5)
+    cells = np.where(measured.mask, np.hypot(x, y) // 5 * 12 + np.degrees(np.arctan2(y, x)) % 120 // 10, -1).astype(int)
+    comparison = FoldedComparison(measured, settings, cells) if folded else Comparison(measured, settings)
+    box = comparison.box
+    drawn = Sampler(run, HERE, measured, box, 5, 7).map(LATERAL, 3)
+    values, cells = measured.values[box], cells[box]
+    measured_noise = np.random.default_rng((5, 0)).poisson(values, (50, *values.shape)) - values
+    correction = comparison.measured_noise + comparison.variance_of(drawn.noise[None], drawn.counts)
+
+    def similarity(first, second):
+        if not folded:
+            moments = local_moments(first), local_moments(second)
+            return local_similarity(*moments, settings.data_range, correction)[comparison.inside].mean()
+        number = np.bincount(cells[cells >= 0])
+        one, two = (
+            (np.bincount(cells[cells >= 0], each[cells >= 0]) / np.maximum(number, 1)).repeat(number)
+            for each in (first, second)
+        )
+        return (2 * np.cov(one, two, ddof=0)[0, 1] + correction) / (one.var() + two.var())
+
+    def moved(counts, noise, part):
+        return comparison.densities(np.stack([counts, counts + part * noise]))[1]
+
+    changes = []
+    for resample in range(5):
+        weights = drawn.weights[drawn.groups, resample].astype(float)
+        noise = np.bincount(drawn.cells, weights, minlength=drawn.counts.size).reshape(drawn.counts.shape)
+        ends = [
+            similarity(moved(drawn.counts, noise, part), moved(values, measured_noise[resample], part))
+            for part in (-1e-4, 1e-4)
+        ]
+        changes.append((ends[1] - ends[0]) / 2e-4)
+    found = comparison.similarities(drawn)
+    # of central differences the error is some 1e-8 of the step squared; seen 1e-9 to 4e-8 of changes of 0.01
+    assert found[1:] - found[0] == pytest.approx(np.array(changes) - np.mean(changes), abs=1e-6)
+    assert found[1:].std() > 1e-3
 
 
 def test_replicas_have_less_noise(run, redrawn):
@@ -439,7 +483,7 @@ def test_replicas_have_less_noise(run, redrawn):
     again = Sampler(replace(run, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
     alike, one = [], seen(run, LATERAL).ions
     for replicas in (1, 4):
-        maps = [each.maps(LATERAL, replicas)[0][0].astype(int) for each in (sampler, again)]
+        maps = [each.map(LATERAL, replicas).counts.astype(int) for each in (sampler, again)]
         assert maps[0].sum() == pytest.approx(replicas * one, rel=0.05)  # 3 / sqrt(one), rounded up
         alike.append(
             float(ae.similarity(*(ae.DetectorMap.from_array(map, EDGES, EDGES, is_counts=True) for map in maps)))
@@ -454,16 +498,15 @@ def test_noise_that_is_allowed_for_is_that_of_the_maps(run, other):
     comparison = Comparison(measured, FitSettings(smoothing=2.5, flattening=15.0, resamples=0, seed=3))
     whole = (slice(0, 48), slice(0, 48))
     sampler = Sampler(run, HERE, measured, whole, 0, 0)
-    maps, noise = sampler.maps(LATERAL, draws)
-    variance = comparison.variance_of(noise[None], maps)[comparison.inside].mean()
+    drawn = sampler.map(LATERAL, draws)
+    variance = comparison.variance_of(drawn.noise[None], drawn.counts)[comparison.inside].mean()
     # the same ions drawn again, forty times: their mean is free of noise
-    again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).maps(LATERAL, draws)[0] for s in range(40)]
-    again = np.concatenate(again)
-    scatter = comparison.variance_of((again - again.mean(axis=0)) * np.sqrt(40 / 39), again.mean(axis=0, keepdims=True))
+    again = [Sampler(replace(run, seed=s), HERE, measured, whole, 0, 0).map(LATERAL, draws).counts for s in range(40)]
+    scatter = comparison.variance_of((again - np.mean(again, axis=0)) * np.sqrt(40 / 39), np.mean(again, axis=0))
     # one estimate from about (48 / 6)^2 windows of ten degrees of freedom: 6 %
     assert variance == pytest.approx(scatter[comparison.inside].mean(), rel=0.2)
     drawn = np.random.default_rng(8).poisson(measured.values, (200, 48, 48)) - measured.values
-    poisson = comparison.variance_of(drawn, measured.values[None].astype(float))[comparison.inside].mean()
+    poisson = comparison.variance_of(drawn, measured.values.astype(float))[comparison.inside].mean()
     assert comparison.measured_noise[comparison.inside].mean() == pytest.approx(poisson, rel=0.05)
 
 
@@ -481,7 +524,7 @@ def test_noise_does_not_draw_to_more_contrast():
             comparison = Comparison(
                 measured, FitSettings(smoothing=2.5, flattening=0.0, allow_noise=allowed, resamples=0, seed=seed)
             )
-            found.append([float(comparison.similarities(1 + c * pattern[None])[0]) for c in contrasts])
+            found.append([comparison.similarity(1 + c * pattern) for c in contrasts])
     allowed, plain = (np.mean(alike[key], axis=0) for key in (True, False))
     assert contrasts[allowed.argmax()] == 0.2 and allowed[2] == pytest.approx(1, abs=0.02)
     assert contrasts[plain.argmax()] > 0.2
