@@ -113,40 +113,53 @@ def misfits(const double[:, ::1] matrix, const double[:, :, ::1] coefficients, c
     return np.asarray(sums)
 
 
-def evaluate(const signed char[:, ::1] exponents, const float[:, :, ::1] coefficients, const double[:, ::1] variables):
+def evaluate(
+    const signed char[:, ::1] exponents,
+    const float[:, :, ::1] coefficients,
+    const double[:, ::1] variables,
+    const Index[::1] ions,
+):
     """Values of the polynomials of n ions, each at its own point.
 
     Parameters
     ----------
     exponents : ndarray of int8, shape (c, v)
         Exponents of the monomials.
-    coefficients : ndarray of float32, shape (n, 3, c)
-        Coefficients of the three quantities of each ion.
+    coefficients : ndarray of float32, shape (m, 3, c)
+        Coefficients of the three quantities of all ions.
     variables : ndarray, shape (n, v)
         Points.
+    ions : ndarray of int, shape (n,)
+        Rows of the ions in `coefficients`.
 
     Returns
     -------
     ndarray, shape (n, 3)
     """
     cdef double monomial[MAX_MONOMIALS]
-    cdef double total
-    cdef Index i, n = variables.shape[0]
-    cdef int k, c, m = <int>exponents.shape[0]
+    cdef double first, second, third
+    cdef Index i, ion, n = ions.shape[0]
+    cdef int c, m = <int>exponents.shape[0]
     cdef double[:, ::1] values = np.empty((n, 3))
     _check(np.asarray(exponents))
-    if coefficients.shape[0] != n or coefficients.shape[1] != 3 or coefficients.shape[2] != m \
+    if coefficients.shape[1] != 3 or coefficients.shape[2] != m or variables.shape[0] != n \
             or variables.shape[1] != exponents.shape[1]:
         raise ValueError(
-            f"coefficients of {m} monomials of {n} ions must have shape ({n}, 3, {m}), got "
-            f"{(coefficients.shape[0], coefficients.shape[1], coefficients.shape[2])}"
+            f"coefficients of {m} monomials must have shape (ions, 3, {m}), and variables ({n}, {exponents.shape[1]}), "
+            f"got {(coefficients.shape[0], coefficients.shape[1], coefficients.shape[2])} and "
+            f"{(variables.shape[0], variables.shape[1])}"
         )
+    if n and not 0 <= np.min(np.asarray(ions)) <= np.max(np.asarray(ions)) < coefficients.shape[0]:
+        raise ValueError(f"ions must be rows of the coefficients, 0 to {coefficients.shape[0] - 1}")
     with nogil:
         for i in range(n):
+            ion = ions[i]
             fill(exponents, &variables[i, 0], monomial)
-            for k in range(3):
-                total = 0.0
-                for c in range(m):
-                    total += coefficients[i, k, c] * monomial[c]
-                values[i, k] = total
+            # three sums side by side: none waits for the addition before
+            first = second = third = 0.0
+            for c in range(m):
+                first += coefficients[ion, 0, c] * monomial[c]
+                second += coefficients[ion, 1, c] * monomial[c]
+                third += coefficients[ion, 2, c] * monomial[c]
+            values[i, 0], values[i, 1], values[i, 2] = first, second, third
     return np.asarray(values)

@@ -23,7 +23,7 @@ from apt_evap.fit.comparison import Comparison
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid, maxima, spline_maxima
 from apt_evap.fit.intervals import Intervals
-from apt_evap.fit.resampling import Sampler, hits_of_draw
+from apt_evap.fit.resampling import Sampler, places_of_draw
 from apt_evap.fit.structure import PoleMeasure, Structure
 from apt_evap.fit.study import Optimum, Score
 from apt_evap.maps.registration.register import Registration, register
@@ -82,8 +82,8 @@ class EnergySearch:
 
     def hits(self, index: ArrayLike) -> Hits:
         """Detected hits of several draws of all ions at an index of the grid, in the frame of the run."""
-        draws = [hits_of_draw(self.run, self.perturbation(index), draw) for draw in range(ROUGH)]
-        x, y = (np.concatenate([getattr(hits, name)[hits.detected] for hits in draws]) for name in ("x", "y"))
+        draws = [places_of_draw(self.run, self.perturbation(index), draw) for draw in range(ROUGH)]
+        x, y = (np.concatenate([places[axis][places[2]] for places in draws]) for axis in (0, 1))
         return Hits(x=x, y=y)
 
     def refine_registration(self, registration: Registration, index: ArrayLike) -> Registration:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap._common.types import Floats, Integers
+from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Outcome
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.simulation.run import Run
@@ -121,10 +121,9 @@ class Sampler:
 
     def _cells(self, perturbation, draw):
         """Bins and indices of the ions within the box."""
-        hits = self.registration.hits(hits_of_draw(self.run, perturbation, draw))
-        detected = hits.detected
+        x, y, detected = places_of_draw(self.run, perturbation, draw)
         index = []
-        for values, edges in zip((hits.y, hits.x), self._edges, strict=True):
+        for values, edges in zip(reversed(self.registration.points(x, y)), self._edges, strict=True):
             number = len(edges) - 1
             place = (values - edges[0]) * (number / (edges[-1] - edges[0]))
             detected &= (place >= 0) & (place < number)
@@ -134,10 +133,14 @@ class Sampler:
         return row * self.shape[1] + column, inside
 
 
-def hits_of_draw(run: Run, perturbation: Perturbation, draw: int) -> Hits:
-    """Hits for one draw of the energies and directions of all ions; draw 0 is that of the run."""
+def places_of_draw(run: Run, perturbation: Perturbation, draw: int) -> tuple[Floats, Floats, Booleans]:
+    """Positions x, y [mm] and whether they are on the detector, for one draw of the energies and directions of all ions.
+
+    Draw 0 is that of the run.
+    """
     if draw:  # derived, because an adjacent seed may be that of another run
         seed = np.random.SeedSequence((run.seed, draw)).generate_state(1, np.uint64)[0]
         run = replace(run, seed=int(seed))
     # flights of the run used its own seed
-    return run.hits(perturbation, by_response=bool(draw))
+    x, y, outcome = run.places(perturbation, by_response=bool(draw))
+    return x, y, outcome == Outcome.HIT

@@ -93,9 +93,12 @@ class Observation:
             extent=self.detector.extent if self._sees_whole_detector else None,
         )
 
-    def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
+    def places(
+        self, perturbation: Perturbation, by_response: bool = False
+    ) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits [mm] and outcomes, see `Run.places`."""
-        x, y, _, outcome = self._impacts(*self._flights(perturbation))
+        check_switch(by_response, "by_response")
+        x, y, _, outcome = self._impacts(*self._flights(perturbation, by_response))
         return x, y, outcome
 
     def _flights(self, perturbation: Perturbation, by_response: bool = False) -> tuple[Floats, Floats, Booleans]:

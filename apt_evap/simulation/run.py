@@ -200,12 +200,14 @@ class Run(RunTable):
         number = np.array([names.index(element) for element in self.elements])
         return PointCloud(self.emissions.positions, number[self.species], names, source="sites of the run")
 
-    def places(self, perturbation: Perturbation) -> tuple[Floats, Floats, NDArray[np.int8]]:
+    def places(
+        self, perturbation: Perturbation, *, by_response: bool = False
+    ) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits alone, the same as those of `hits`.
 
         Parameters
         ----------
-        perturbation : perturbation
+        perturbation, by_response
             As for `hits`.
 
         Returns
@@ -220,7 +222,7 @@ class Run(RunTable):
         ValueError
             As for `hits`.
         """
-        return self.observation.places(perturbation)
+        return self.observation.places(perturbation, by_response)
 
     def grid(self, bins: int) -> DetectorMap:
         """Empty map of the complete detector, for the `like` of maps of this run.

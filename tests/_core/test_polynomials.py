@@ -19,9 +19,10 @@ def test_monomials_and_values(degree, rng):
     expected = np.stack(columns, axis=1)
     assert polynomials.monomials(exponents_of(degree), velocities) == pytest.approx(expected, rel=1e-14)
     coefficients = rng.normal(size=(7, 3, expected.shape[1])).astype(np.float32)
-    values = polynomials.evaluate(exponents_of(degree), coefficients, velocities)
-    scale = np.abs(coefficients[:, :, None] * expected[:, None, None]).sum(axis=(2, 3))
-    assert np.abs(values - np.einsum("nkc,nc->nk", coefficients, expected)).max() <= 1e-14 * scale.max()
+    ions = np.array([6, 0, 0, 3, 5, 1, 2])
+    values = polynomials.evaluate(exponents_of(degree), coefficients, velocities, ions)
+    scale = np.abs(coefficients[ions, :, None] * expected[:, None, None]).sum(axis=(2, 3))
+    assert np.abs(values - np.einsum("nkc,nc->nk", coefficients[ions], expected)).max() <= 1e-14 * scale.max()
 
 
 def test_fits_and_misfits(rng):
@@ -42,16 +43,31 @@ def test_five_variables(rng):
     assert polynomials.monomials(exponents, points) == pytest.approx(expected, rel=1e-13)
     coefficients = rng.normal(size=(6, 3, 30)).astype(np.float32)
     scale = np.abs(coefficients).max() * np.abs(expected).sum(axis=1).max()
-    values = polynomials.evaluate(exponents, coefficients, points)
+    values = polynomials.evaluate(exponents, coefficients, points, np.arange(6))
     assert np.abs(values - np.einsum("nkc,nc->nk", coefficients, expected)).max() <= 1e-13 * scale
 
 
 @pytest.mark.parametrize(
-    ("degree", "shape"), [(1, (2, 3, 4)), (1, (3, 3, 3)), (1, (2, 2, 3)), (12, (2, 3, 90)), (0, (2, 3, 0))]
+    ("degree", "shape", "points"),
+    [
+        (1, (2, 3, 4), 2),
+        (1, (3, 3, 3), 3),
+        (1, (2, 2, 3), 2),
+        (12, (2, 3, 90), 2),
+        (0, (2, 3, 0), 2),
+    ],
 )
-def test_shapes_that_do_not_fit_are_refused(degree, shape):
+def test_shapes_that_do_not_fit_are_refused(degree, shape, points):
     with pytest.raises(ValueError, match="must have shape"):
-        polynomials.evaluate(exponents_of(degree), np.zeros(shape, np.float32), np.zeros((2, 2)))
+        polynomials.evaluate(
+            exponents_of(degree), np.zeros(shape, np.float32), np.zeros((points, 2)), np.zeros(2, int)
+        )
+
+
+@pytest.mark.parametrize("ion", [-1, 2])
+def test_ions_without_coefficients_are_refused(ion):
+    with pytest.raises(ValueError, match="rows of the coefficients, 0 to 1"):
+        polynomials.evaluate(exponents_of(1), np.zeros((2, 3, 3), np.float32), np.zeros((1, 2)), np.array([ion]))
 
 
 @pytest.mark.parametrize("exponent", [-1, 13])

@@ -80,7 +80,7 @@ def test_polynomials_are_found_again(degree, coefficients, seed):
     assert residual.max() < 1e-12
     variables = np.random.default_rng(seed).uniform(-1, 1, (2, 3))
     expected = np.einsum("nc,nkc->nk", np.prod(variables[:, None] ** exponents, axis=2), coefficients)
-    assert np.abs(design.evaluate(fitted, variables) - expected).max() < 16 * 2e-7
+    assert np.abs(design.evaluate(fitted, variables, np.arange(2)) - expected).max() < 16 * 2e-7
 
 
 def test_the_fit_is_weighted_least_squares():

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 import apt_evap._core.polynomials as polynomials
 from apt_evap._common.codec import checked, count, settings, switch, to_python
 from apt_evap._common.small_matrices import left_inverse, pseudo_inverse
-from apt_evap._common.types import Floats
+from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, check_sequence, short_text
 from apt_evap._core.elementary import sine_and_cosine
 
@@ -171,12 +171,13 @@ class Design:
                 residual[ion] = np.inf
         return np.ascontiguousarray(coefficients, np.float32), residual
 
-    def evaluate(self, coefficients: NDArray[np.float32], variables: Floats) -> Floats:
-        """Values of the polynomials of n ions at variables (n, v) in the order of `columns`; shape (n, 3)."""
+    def evaluate(self, coefficients: NDArray[np.float32], variables: Floats, ions: Integers) -> Floats:
+        """Values of the polynomials of n `ions` at variables (n, v) in the order of `columns`; shape (n, 3)."""
         return polynomials.evaluate(
             self.exponents,
             np.ascontiguousarray(coefficients, np.float32),
             np.ascontiguousarray(variables, np.float64),
+            np.ascontiguousarray(ions, np.int64),
         )
 
 

@@ -296,12 +296,13 @@ class ResponseModel:
                 ResponseWarning,
                 "run with a larger energy_limit (ResponseSettings, or [responses] in a settings file)",
             )
-        values = np.empty((len(velocities), 3))
+        values = np.full((len(velocities), 3), np.nan)
         starts = (~launches.rolled, launches.rolled)
         polynomials = (responses.site, responses.rolled)
-        for design, coefficients, mask in zip(self.settings.designs, polynomials, starts, strict=True):
-            ions = slice(None) if mask.all() else mask
-            values[ions] = design.evaluate(coefficients[ions], variables[ions][:, list(design.columns)])
+        flown = True if responses.not_flown is None else ~responses.not_flown
+        for design, coefficients, started in zip(self.settings.designs, polynomials, starts, strict=True):
+            ions = np.flatnonzero(started & flown)
+            values[ions] = design.evaluate(coefficients, variables[np.ix_(ions, design.columns)], ions)
         return directions_and_times(values)
 
     def flagged(self, responses: Responses, emissions: Emissions) -> Booleans:
