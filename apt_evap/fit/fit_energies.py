@@ -33,6 +33,10 @@ from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, 
 DRAWN = 10
 """Target ratio of simulated (all draws) to measured ions, with `FEWEST` to `MOST` draws per ion."""
 FEWEST, MOST = 4, 16
+# s of one processor for a launch, and for a map beside its launches. Measured (AMD EPYC) with tungsten, 10,120 and
+# 33,008 ions, 16 draws: 30 and 91 s for 305 maps; folded maps of nickel, 10,192 ions, 8 draws: 27 s; aluminium, 16
+# draws: 10 s for 61 maps
+_PER_LAUNCH, _PER_MAP = 0.5e-6, 25e-3
 
 
 def fit_energies(
@@ -365,3 +369,9 @@ def draws_per_ion(measured: DetectorMap, ions: int) -> int:
     """Draws of each ion of a run for `DRAWN` times the measured ions; their number is not known for densities."""
     number = DRAWN * measured.values.sum() / ions if measured.is_counts else 2 * FEWEST
     return int(np.clip(np.ceil(number), FEWEST, MOST))
+
+
+def seconds_of_fit(measured: DetectorMap, grid: EnergyGrid, ions: int) -> float:
+    """Processor time of `fit_energies` for a run of so many ions, without a registration [s]."""
+    maps = math.prod(grid.shape) + math.prod(map(len, grid.around((0,) * len(grid.shape))))
+    return maps * (_PER_MAP + _PER_LAUNCH * ions * draws_per_ion(measured, max(ions, 1)))

@@ -134,7 +134,7 @@ class Sampler:
 
 
 def places_of_draw(run: Run, perturbation: Perturbation, draw: int) -> tuple[Floats, Floats, Booleans]:
-    """Positions x, y [mm] and whether they are on the detector, for one draw of the energies and directions of all ions.
+    """Positions x, y [mm] of all ions for one draw of their energies and directions, and whether they are detected.
 
     Draw 0 is that of the run.
     """

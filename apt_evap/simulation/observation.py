@@ -93,9 +93,7 @@ class Observation:
             extent=self.detector.extent if self._sees_whole_detector else None,
         )
 
-    def places(
-        self, perturbation: Perturbation, by_response: bool = False
-    ) -> tuple[Floats, Floats, NDArray[np.int8]]:
+    def places(self, perturbation: Perturbation, by_response: bool = False) -> tuple[Floats, Floats, NDArray[np.int8]]:
         """Positions of the hits [mm] and outcomes, see `Run.places`."""
         check_switch(by_response, "by_response")
         x, y, _, outcome = self._impacts(*self._flights(perturbation, by_response))

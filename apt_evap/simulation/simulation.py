@@ -165,7 +165,7 @@ class Simulation:
         progress: bool | Callable[[int, int], object] | None = None,
         batch_size: int = BATCH,
         checkpoint: Checkpoint | AnyPath | None = None,
-        seconds: float | None = None,
+        seconds: float | Callable[[int], float] | None = None,
         fewest: int = 1,
     ) -> Run:
         """Evaporate atoms and fly their ions.
@@ -191,9 +191,10 @@ class Simulation:
         checkpoint : Checkpoint or str or path-like, optional
             File in which the run is stored at intervals and at its end; a file name for the default settings. A run
             that is killed and resumed gives the same bits as an uninterrupted one.
-        seconds : float, optional
-            Time after which the run ends with the ions so far, as with Ctrl-C [s]. The ions are the first ones of the
-            whole run, bit by bit; their number depends on the machine.
+        seconds : float or callable, optional
+            Time after which the run ends with the ions so far, as with Ctrl-C [s]; or a function of the number of ions
+            so far that returns it. The ions are the first ones of the whole run, bit by bit; their number depends on
+            the machine.
         fewest : int
             Ions before which this time does not end the run.
 
@@ -411,5 +412,8 @@ def _time_limit(seconds, fewest):
     fewest = check_count(fewest, "fewest", at_least=1)
     if seconds is None:
         return lambda ions: False
-    ends_at = time.monotonic() + check_number(seconds, "seconds", at_least=0, unit="s")
-    return lambda ions: ions >= fewest and time.monotonic() >= ends_at
+    began = time.monotonic()
+    if callable(seconds):
+        return lambda ions: ions >= fewest and time.monotonic() - began >= seconds(ions)
+    length = check_number(seconds, "seconds", at_least=0, unit="s")
+    return lambda ions: ions >= fewest and time.monotonic() - began >= length

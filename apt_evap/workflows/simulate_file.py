@@ -11,7 +11,7 @@ from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
 from apt_evap.analysis.description import real_units_line
-from apt_evap.config.cost_estimate import estimate_cost, hours_text
+from apt_evap.config.cost_estimate import estimate_cost
 from apt_evap.config.simulation_file import config_of, read_document
 from apt_evap.config.simulation_settings import Config
 from apt_evap.detection.detector_map import DetectorMap
@@ -89,7 +89,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     checkpoint: float = 10.0,
-    seconds: float | None = None,
+    seconds: float | Callable[[int], float] | None = None,
     fewest: int = 1,
     own_classes: bool = False,
     progress: Any = None,
@@ -120,8 +120,9 @@ def simulate(
         Whether to replace unfinished and other runs, and files that were not made by this package.
     checkpoint : float
         Time between two checkpoints [min].
-    seconds : float, optional
-        Time from this call after which the events end, with the ions so far [s].
+    seconds : float or callable, optional
+        Time from this call after which the events end, with the ions so far [s]; or a function of the number of ions
+        so far that returns it.
     fewest : int
         Ions before which this time does not end the events.
     own_classes : bool
@@ -176,7 +177,7 @@ def simulate(
     n_ions = config.n_ions
     cost = estimate_cost(config, 1)
     if seconds is not None:
-        note(f"at most {n_ions:,} ions, as many as {hours_text(seconds / 3600)} allow")
+        note(f"at most {n_ions:,} ions, as many as the time allows")
     else:
         note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
     note("building the specimen and relaxing the charges of its surface")
@@ -188,7 +189,7 @@ def simulate(
     n_previous = stored.ions_there() if resume else 0
     if 0 < n_previous < n_ions:
         note(f"resumed at {n_previous:,} of {n_ions:,} ions")
-    left = None if seconds is None else max(seconds - (time.monotonic() - called), 0.0)
+    left = None if seconds is None else _less(seconds, time.monotonic() - called)
     run = _evaporated(config, simulation, stored, n_previous, progress, {"seconds": left, "fewest": fewest})
     seconds = time.perf_counter() - began
     if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
@@ -206,6 +207,13 @@ def simulate(
         note(line)
     note(f"{'replaced' if replaced and not resume else 'wrote'} {path}")
     return _drawn(run, path, picture, config, seconds, note)
+
+
+def _less(seconds, spent):
+    """The time that is left for the events, or a function that gives it."""
+    if callable(seconds):
+        return lambda ions: seconds(ions) - spent
+    return max(seconds - spent, 0.0)
 
 
 def _drawn(run, path, picture, config, seconds, note):

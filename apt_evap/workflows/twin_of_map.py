@@ -22,7 +22,7 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.projection import Projection
-from apt_evap.fit.fit_energies import draws_per_ion
+from apt_evap.fit.fit_energies import seconds_of_fit
 from apt_evap.fit.grid import EnergyGrid
 from apt_evap.fit.indexed_registration import (
     HEIGHT,
@@ -60,10 +60,8 @@ _REPORT = f"{STUDY}/{REPORT}"
 _FRACTIONS = (0.2, 0.4, 0.6, 0.8, 1.0)  # that roll up, in the fit
 _HEIGHT: Mapping[str, Sequence[float]] = {"height": (HEIGHT,)}
 _BINS = 128  # of a map of ions
-# The fit takes _FIT processor seconds, and for each draw per ion _FIT_PER_DRAW of the time of the simulation. Measured
-# in one case, nickel, R = 11 nm, 38,150 ions, 8 draws, 88 s of one thread: the fit takes 108 s, 45 s of them whatever
-# the ions are. With it 3 minutes of nickel took 181 s on two cores, those of tungsten 236 s.
-_FIT, _FIT_PER_DRAW = 45.0, 0.09
+# s; the pictures of the run, its registration and the report, whatever the ions and the threads are
+_REPORTING = 14.0
 _LEAST_PART = 0.2  # of the time is for the simulation, however long the fit takes
 _SPARE = 4.0  # times the ions that the estimate allows are asked for, because the clock ends the run
 
@@ -204,7 +202,7 @@ class Twin:
         earlier = load(path) if path.exists() else None
         if earlier is None or not _ended_in_time(earlier, config.key):
             whole = earlier is not None and earlier.ended == StopReason.COMPLETE
-            self._make_run(path, None if whole else self._seconds(ends_at, config.n_ions))
+            self._make_run(path, None if whole else self._seconds(ends_at))
         else:
             self._note(f"{path} has the {len(earlier):,} ions of its time: nothing to do")
         told: list[str] = []
@@ -220,11 +218,16 @@ class Twin:
         self._note("\n".join(line for line in self.answer if line not in told))
         self._note(f"wrote {self.report()}")
 
-    def _seconds(self, ends_at, ions):
-        """Time of the simulation [s], which leaves that of the fit."""
-        left = ends_at - time.monotonic() - _FIT / thread_count(self._threads)
-        left /= 1 + _FIT_PER_DRAW * draws_per_ion(self.measured_map, ions)
-        return max(left, _LEAST_PART * 60 * self._options.minutes)
+    def _seconds(self, ends_at):
+        """Time of the simulation [s], which leaves that of the fit; a function of its ions so far."""
+        now, least = time.monotonic(), _LEAST_PART * 60 * self._options.minutes
+        measured, grid, threads = self.measured_map, self._grid, thread_count(self._threads)
+
+        def seconds(ions):
+            fit = _REPORTING + seconds_of_fit(measured, grid, ions) / threads
+            return max(ends_at - now - fit, least)
+
+        return seconds
 
     def _make_run(self, path, seconds):
         """Simulate until this time is over, or until the tip has evaporated as far as it may."""
@@ -281,15 +284,13 @@ class Twin:
         """The study, with its files if there is a folder."""
         from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
 
-        options = {"probability": _FRACTIONS, "sharpness": (SHARPNESS,), "height": (HEIGHT,)}
-        grid = EnergyGrid("roll-up", options=options) if self._rolls else EnergyGrid("lateral", options=_HEIGHT)
         written = folder is not None
         with recorded_warnings(IN_LINES):
             return compare(
                 run,
                 measured,
                 folder,
-                grid,
+                self._grid,
                 registration=self.registration,
                 threads=self._threads,
                 progress=False if self._progress is False else None,
@@ -310,9 +311,11 @@ class Twin:
             raise FileError(f"{str(path)!r} is not a result of apt-evap twin: {error}") from None
 
     @property
-    def _rolls(self):
-        """Whether the measured ions roll up."""
-        return self._facts.best.rolled >= ROLLS
+    def _grid(self):
+        """Energies of the fit: of a roll-up if the measured ions roll up."""
+        if self._facts.best.rolled < ROLLS:
+            return EnergyGrid("lateral", options=_HEIGHT)
+        return EnergyGrid("roll-up", options={"probability": _FRACTIONS, "sharpness": (SHARPNESS,)} | _HEIGHT)
 
     def _as_read(self):
         """The measurement; its file, for the report, is read again for the composition of all its ions only."""

@@ -59,9 +59,7 @@ def test_five_variables(rng):
 )
 def test_shapes_that_do_not_fit_are_refused(degree, shape, points):
     with pytest.raises(ValueError, match="must have shape"):
-        polynomials.evaluate(
-            exponents_of(degree), np.zeros(shape, np.float32), np.zeros((points, 2)), np.zeros(2, int)
-        )
+        polynomials.evaluate(exponents_of(degree), np.zeros(shape, np.float32), np.zeros((points, 2)), np.zeros(2, int))
 
 
 @pytest.mark.parametrize("ion", [-1, 2])

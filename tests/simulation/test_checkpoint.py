@@ -218,6 +218,7 @@ def test_a_run_whose_time_is_over_has_the_first_ions_and_can_be_resumed(tmp_path
     whole = small().run(90, checkpoint=tmp_path / "whole.h5", **options)
     assert whole.ended == "" and differing(tmp_path / "run.h5", tmp_path / "whole.h5") == []
     assert small().run(30, seconds=0, **options).ended == ""  # nothing was left to do
+    assert len(small().run(90, seconds=lambda ions: 1000 if ions < 60 else 0, **options)) == 60
     for wrong in (-1, float("nan"), "1 min"):
         with pytest.raises(ValueError, match="seconds"):
             small().run(90, seconds=wrong, **options)

@@ -183,9 +183,11 @@ def test_the_simulation_leaves_time_for_the_fit(quick, monkeypatch):
     for minutes, threads in ((10, 1), (10, 2), (1, 1)):
         ae.twin("ni.epos", "Ni", scales=(56, 64), minutes=minutes, threads=threads, folder=f"t{minutes}{threads}")
     one, two, short = seconds
-    # 6,000 measured ions: four draws per ion, whose fit takes 0.36 of the time of the simulation, and 45 s beside it
-    assert one == pytest.approx((600 - 45) / 1.36) and two == pytest.approx((600 - 22.5) / 1.36)
-    assert short == 12  # a fifth at least
+    # 6,000 measured ions: four draws of 20,000 ions, 180 maps of the grid and 125 between its points
+    fit = 305 * (0.025 + 0.5e-6 * 4 * 20_000)
+    assert one(20_000) == pytest.approx(600 - 14 - fit) and two(20_000) == pytest.approx(600 - 14 - fit / 2)
+    assert one(40_000) < one(20_000) < one(5_000)
+    assert short(1_000_000) == 12  # a fifth at least
 
 
 def test_a_folder_of_others_stays_as_it_is(quick, capsys, tmp_path):
