@@ -302,7 +302,7 @@ class ResponseModel:
         flown = True if responses.not_flown is None else ~responses.not_flown
         for design, coefficients, started in zip(self.settings.designs, polynomials, starts, strict=True):
             ions = np.flatnonzero(started & flown)
-            values[ions] = design.evaluate(coefficients, variables[np.ix_(ions, design.columns)], ions)
+            values[ions] = design.evaluate(coefficients, variables[ions][:, list(design.columns)], ions)
         return directions_and_times(values)
 
     def flagged(self, responses: Responses, emissions: Emissions) -> Booleans:
