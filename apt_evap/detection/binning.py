@@ -127,11 +127,6 @@ def bin_edges(
     -------
     x_edges, y_edges : ndarray
         Edges [mm].
-
-    Raises
-    ------
-    ValueError
-        If `bins` or `extent` is invalid.
     """
     bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if extent is None:

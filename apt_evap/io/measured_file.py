@@ -15,9 +15,9 @@ from apt_evap._common.kept import digest_of
 from apt_evap._common.validation import check_array, check_kind, check_number, check_sequence, did_you_mean, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.io import formats
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
 
 _ARRAYS = ("values", "x_edges", "y_edges", "mask")

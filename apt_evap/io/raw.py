@@ -60,13 +60,6 @@ def read_raw(
     Hits
         With voltage, pulse_voltage [V], x, y [mm], time_of_flight [ns], pulse_id and multiplicity;
         ``extra`` contains "reflectron_voltage" [V], "epoch" and "pulse_number".
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
-    TruncatedFile
-        If the size is not a multiple of 32 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
@@ -89,11 +82,6 @@ def chunk_raw(
     Yields
     ------
     Hits
-
-    Raises
-    ------
-    ValueError
-        If `rows` is less than the number of ions of one pulse.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}

@@ -236,21 +236,7 @@ def material(name: str, **changes: Any) -> Material:
 
 
 def as_material(value: Material | str | Mapping[str, Any], name: str = "material") -> Material:
-    """Return a Material, looked up if `value` is a name.
-
-    Parameters
-    ----------
-    value : Material or str or mapping
-        Material, the name of a known one, or a table of a file: the name of a known one and the numbers that are
-        changed, or all fields.
-    name : str
-        Name of the argument, for the message.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, or if no material has this name.
-    """
+    """Return a Material, looked up if `value` is a name."""
     if isinstance(value, str):
         return material(value)
     if isinstance(value, Mapping):

@@ -37,8 +37,6 @@ from apt_evap._common.validation import (
 from apt_evap.analysis.apex import field_factor
 from apt_evap.analysis.ion_image import tunnel_factor
 from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
-from apt_evap.config.cost_estimate import CostEstimate
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
@@ -47,6 +45,8 @@ from apt_evap.maps.crystallography.directions import direction_normals, plane_no
 from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
 from apt_evap.maps.noise import effective_ions
 from apt_evap.maps.registration.polynomial import Distortion
+from apt_evap.simulation.config.cost_estimate import CostEstimate
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.specimen.lattice import nearest_neighbour_distance
 from apt_evap.specimen.materials import polarization_energy

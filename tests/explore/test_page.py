@@ -12,11 +12,11 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.color_limits import color_limits, common_limits
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
 from apt_evap.explore.specimen_surface import surface_atoms
+from apt_evap.simulation.config.simulation_file import read_config
 
 pytest.importorskip("bokeh")
 

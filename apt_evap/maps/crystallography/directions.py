@@ -168,11 +168,6 @@ def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -
     -------
     ndarray
         Shape (n, 3).
-
-    Raises
-    ------
-    ValueError
-        If indices are all zero, or if the sum rule for hcp is violated.
     """
     planes = _three(material, planes, name, lambda h, k, _, last: (h, k, last))
     normals = planes @ _reciprocal(material)
@@ -195,11 +190,6 @@ def direction_normals(material: Material, directions: ArrayLike, name: str = "di
     -------
     ndarray
         Shape (n, 3).
-
-    Raises
-    ------
-    ValueError
-        If indices are all zero, or if the sum rule for hcp is violated.
     """
     directions = _three(material, directions, name, lambda u, v, t, w: (u - t, v - t, w))
     vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)

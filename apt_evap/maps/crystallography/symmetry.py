@@ -20,11 +20,6 @@ _TOLERANCE = 1e-6  # of the axis: orientations by integers are exact to rounding
 def point_group(structure: str) -> Floats:
     """Rotations and reflections that map the lattice of a structure onto itself.
 
-    Parameters
-    ----------
-    structure : str
-        One of fcc, bcc, sc, diamond, hcp.
-
     Returns
     -------
     ndarray
@@ -56,16 +51,6 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
         The crystal.
     direction : array_like
         In the Cartesian frame of the crystal, of any length, shape (3,).
-
-    Returns
-    -------
-    PoleSymmetry
-        `toward` has symmetric directions for symmetric poles, so that maps about them can be compared.
-
-    Raises
-    ------
-    ValueError
-        If the direction is zero.
 
     Examples
     --------

@@ -55,15 +55,6 @@ def second_lattice(view: View, terms: Terms, fit: Refined) -> tuple[float, float
     """Evidence of the local contrast for a second lattice, and that of the winner in the half where it has least.
 
     The first one is the largest evidence of another orientation over that of the winner, or of no crystal, in any half.
-
-    Parameters
-    ----------
-    view : View
-        The map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    fit : Refined
-        The winner.
     """
     windows = _windows()
     pictures = _in_windows(view.picture, windows)
@@ -183,17 +174,7 @@ class SecondGrain(NamedTuple):
 
 
 def second_grain(view: View, terms: Terms, fit: Refined) -> SecondGrain:
-    """Likelihood of another orientation in a segment of the disc, with the amplitudes of the winner.
-
-    Parameters
-    ----------
-    view : View
-        The map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    fit : Refined
-        The winner.
-    """
+    """Likelihood of another orientation in a segment of the disc, with the amplitudes of the winner."""
     places, areas = places_of()
     radius, picture = view.disc.radius, view.picture
     # what the winner shows in any direction of the crystal, and the variance that it leaves

@@ -231,11 +231,6 @@ def distinct_starts(
         Largest number of results.
     axis_step, scale_step : float
         Steps of the search: of the axes [degrees], and of the logarithm of the scale.
-
-    Returns
-    -------
-    list of Start
-        The best first.
     """
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []

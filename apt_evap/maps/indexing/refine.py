@@ -346,10 +346,6 @@ def refine(
         Largest number of iterations.
     bounds : tuple of float, optional
         Bounds of the scale at the centre [mm/rad].
-
-    Returns
-    -------
-    Refined
     """
     geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
     if bounds is not None:

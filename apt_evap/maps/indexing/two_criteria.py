@@ -65,11 +65,6 @@ def angle_between(first: Refined | Explained, second: Refined | Explained, group
         Point group of the crystal, shape (n, 3, 3).
     radius : float
         Of the disc [mm].
-
-    Returns
-    -------
-    float
-        The smallest of all equal orientations.
     """
     places, areas = (values[::_EVERY] for values in places_of())
     one, two = (directions_of(places, radius, fit.scale, fit.stretch) @ fit.matrix for fit in (first, second))
@@ -108,11 +103,6 @@ def weighed(
         Marks of a user.
     known : dict, optional
         Refinements of the same map and crystal that are known already; those of this call are added.
-
-    Returns
-    -------
-    list of Weighed
-        Not sorted.
     """
     disc, bins, picture = view
     group = point_group(terms.structure)

@@ -217,21 +217,11 @@ class Page:
 def read_report(path: AnyPath) -> dict[str, Any]:
     """Read the data of a report.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A file of `plot.write_study` or `plot.write_sweep`.
-
     Returns
     -------
     dict
         By name. Of a study: "study", as in study.json, and "origin", its command, files and warnings. Of a sweep:
         "points" and "origin".
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, or is not a report.
     """
     text = read_small_file(path, MAX_BYTES, "a report").decode(errors="replace")
     blocks = re.findall(r'^<script type="application/json" id="([^"]+)">(.*)</script>$', text, re.MULTILINE)

@@ -9,8 +9,9 @@ import pytest
 
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
+from apt_evap.detection import ion_blocks
 from apt_evap.detection.hits import Hits
-from apt_evap.io import formats, ion_blocks
+from apt_evap.io import formats
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.plot import spectra
 from apt_evap.reconstruction import cap_geometry

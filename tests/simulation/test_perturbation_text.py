@@ -4,8 +4,8 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.codec import to_python
-from apt_evap.config.lens_text import read_lens
-from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
+from apt_evap.simulation.config.lens_text import read_lens
+from apt_evap.simulation.config.perturbation_text import read_perturbation, title_of, write_perturbation
 
 NORMAL = ae.TruncatedNormal(0.155, 0.1)
 
