@@ -13,6 +13,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every proce
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+if sys.dont_write_bytecode:  # otherwise every worker and every program of a test compiles all sources
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings

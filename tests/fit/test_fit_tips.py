@@ -30,7 +30,7 @@ def runs(nickel, made_once):
 def fit(runs):
     measured = runs["measured"].hits(ROLLUP)
     candidates = {name: runs[name] for name in ("axis", "right")}
-    return fit_tips(candidates, measured, registration=HERE, bins=32, resamples=40, **GRID)
+    return fit_tips(candidates, measured, registration=HERE, bins=32, resamples=20, **GRID)
 
 
 @pytest.mark.slow
