@@ -174,7 +174,7 @@ def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def direction_normals(material: Material, directions: ArrayLike, name: str = "directions") -> Floats:
+def direction_normals(material: Material, directions: ArrayLike) -> Floats:
     """Unit vectors along lattice directions, in the frame of the crystal.
 
     Parameters
@@ -183,15 +183,13 @@ def direction_normals(material: Material, directions: ArrayLike, name: str = "di
         The crystal.
     directions : array_like
         [u v w], shape (n, 3), or for hcp also [u v t w] with u + v + t = 0, shape (n, 4).
-    name : str
-        Name of the argument, for the message.
 
     Returns
     -------
     ndarray
         Shape (n, 3).
     """
-    directions = _three(material, directions, name, lambda u, v, t, w: (u - t, v - t, w))
+    directions = _three(material, directions, "directions", lambda u, v, t, w: (u - t, v - t, w))
     vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]
 

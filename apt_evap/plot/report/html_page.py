@@ -139,21 +139,7 @@ class Page:
         self._body += parts
 
     def picture(self, figure: Figure, caption: str = "", *, alt: str = "") -> str:
-        """Return a figure with its caption as HTML, with the picture inside.
-
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure
-            The figure, drawn with `DPI` dots per inch.
-        caption : str
-            Text below the picture.
-        alt : str
-            Text for readers without pictures; by default the caption.
-
-        Returns
-        -------
-        str
-        """
+        """Return a figure with its caption as HTML, with the picture inside."""
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=DPI, metadata={"Software": f"apt_evap {__version__}"})
         return self.image(file.getvalue(), caption, alt=alt)
@@ -185,18 +171,7 @@ class Page:
         self._data[name] = text
 
     def save(self, path: AnyPath) -> None:
-        """Write the page; the file is replaced only when complete.
-
-        Parameters
-        ----------
-        path : str or path-like
-            File to write or replace.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        """
+        """Write the page; the file is replaced only when complete."""
         size = f"Pictures: {self._picture_bytes / 1e6:.2g} MB with {DPI} dpi." if self._picture_bytes else ""
         text = _PAGE.substitute(
             title=escape(self.title),
