@@ -181,6 +181,16 @@ def test_blocks_give_the_spectrum_of_the_whole_file(tmp_path, monkeypatch, capsy
     assert json.loads(whole[2][1])["composition"]
 
 
+@pytest.mark.parametrize("rows", [1, 7, 101, 1000])
+def test_the_sample_of_blocks_is_that_of_all_ions(monkeypatch, rows):
+    monkeypatch.setattr(ion_blocks, "SAMPLE", 300)
+    x, y = np.random.default_rng(1).random((2, 1000))
+    field = ion_blocks.Field(len(x))
+    for start in range(0, len(x), rows):
+        field.add(x[start : start + rows], y[start : start + rows])
+    assert all(map(np.array_equal, field.sample, (x[::3], y[::3])))
+
+
 def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
     """Isotopes that are lost in pulses of several ions, which a note of a composition says."""
     monkeypatch.chdir(tmp_path)
