@@ -181,10 +181,6 @@ def write_csv(path: AnyPath, hits: Hits, *, decimals: int | None = None, separat
 
     Parameters
     ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions.
     decimals : int, optional
         Digits after the point, 0 to 17; by default as many as restore the exact values.
     separator : {"comma", "semicolon", "tab"}

@@ -72,21 +72,6 @@ def read_epos(
     coordinates if both are zero. A pulse voltage of zero is read if there is a standing voltage (laser pulsing). The
     column of pulses since the last event is read even if it is zero, and is not used to group ions.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns of `Hits` to read; only these are kept in memory. All by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads big-endian and checks the byte order.
-    voltage_unit : {None, "V", "kV"}
-        Unit of the voltages in the file. By default V, or kV if all voltages are below 100, with a warning.
-    detector_unit : {"mm", "cm", "m", "um"}
-        Unit of the detector coordinates in the file; some programs write cm.
-
     Returns
     -------
     Hits

@@ -58,8 +58,6 @@ def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         Units of LAMMPS: metal, real (Angstrom), electron, nano, micro, cgs or si. A file that states its units is read
         in these.
@@ -174,8 +172,6 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         As for `read_dump`.
     style : str, optional

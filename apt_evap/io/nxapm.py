@@ -52,10 +52,6 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
 
     Parameters
     ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions.
     elements : sequence of str
         Chemical symbols of the elements in the specimen, which NXapm requires, such as ``("Si", "O")``.
     start_time : str, optional

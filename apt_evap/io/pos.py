@@ -21,17 +21,6 @@ def read_pos(
 ) -> Hits:
     """Read a .pos file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read, "positions" and "mass_to_charge"; all by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads big-endian and checks the byte order.
-
     Returns
     -------
     Hits

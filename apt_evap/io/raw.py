@@ -42,19 +42,6 @@ def read_raw(
     Consecutive ions with the same pulse number belong to one pulse; the number may wrap around. If it is zero for all
     ions, they are not grouped.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads little-endian and checks the byte order.
-    detector_unit : {"mm", "cm", "m", "um"}
-        Unit of the detector coordinates in the file.
-
     Returns
     -------
     Hits

@@ -29,8 +29,6 @@ def read_xyz(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         Units of LAMMPS, if it has written the file in others than Angstrom.
     frame : int
