@@ -167,21 +167,7 @@ _NEEDED = {  # runs of each figure; figure 2 has its own specimens, of a few eve
 
 
 class PaperRuns:
-    """The runs of some figures, in a folder.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the figures.
-    size : PaperSize
-        Size of the simulations.
-    threads : int, optional
-        Number of threads; by default the number of processors that this process may use.
-    progress : callable
-        Returns the progress of a run, as for `simulate`.
-    note : callable
-        Receives lines of text on what is done.
-    """
+    """The runs of some figures, in a folder."""
 
     def __init__(
         self,

@@ -73,11 +73,6 @@ class Twin:
 
     What an earlier call has left in the folder is read. The indexing, the study and the measurement are not in it as
     objects: they are computed again when they are first asked for, with the same result.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the files.
     """
 
     def __init__(
