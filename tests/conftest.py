@@ -31,10 +31,10 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import replace_file
-from apt_evap._common.locks import FileLock
 from apt_evap.explore import measured_ions
 from apt_evap.io import measured_file
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.simulation.locks import FileLock
 from apt_evap.spectra import mass_spectrum
 from apt_evap.spectra.mass_spectrum import spectrum
 

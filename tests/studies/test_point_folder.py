@@ -10,8 +10,8 @@ import sys
 import pytest
 from sweeps import check_bits, check_done, do, planned, poison
 
-from apt_evap._common.locks import try_lock
 from apt_evap.cli.main import main
+from apt_evap.simulation.locks import try_lock
 from apt_evap.studies.sweep import point_folder
 from apt_evap.studies.sweep.planning import plan_sweep, retry, sweep_status
 from apt_evap.studies.sweep.point_folder import run_point
