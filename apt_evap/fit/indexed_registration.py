@@ -12,11 +12,11 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.index_map import LEAST_IONS, Indexing, index
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration, at_bound, register, register_points
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.symmetry import point_group
 from apt_evap.warnings import RegistrationWarning, WorkflowWarning, warn
 
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4

@@ -41,7 +41,6 @@ from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
 from apt_evap.emission.surface_frame import tangent_frame, target_shares
 from apt_evap.maps.crystallography.directions import direction_normals, plane_normals
-from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
 from apt_evap.maps.noise import effective_ions
 from apt_evap.maps.registration.polynomial import Distortion
 from apt_evap.simulation.config.cost_estimate import CostEstimate
@@ -49,6 +48,7 @@ from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.specimen.lattice import nearest_neighbour_distance
 from apt_evap.specimen.shape import TaperedCap
+from apt_evap.specimen.symmetry import point_group, pole_symmetry, symmetry_about_axis
 
 NAN, INF = math.nan, math.inf
 NEITHER = [None, "x", "5", True, 1j, [1.0], {}, b"x", object(), np.array([1.0, 2.0])]  # no number

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import plane_normals
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing import orientation_search as polar_pictures
 from apt_evap.maps.indexing.contrast_search import picture_of, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
@@ -28,6 +27,7 @@ from apt_evap.maps.indexing.orientation_search import (
 )
 from apt_evap.maps.indexing.refine import bins_of, deviance, refine
 from apt_evap.maps.indexing.two_criteria import angle_between
+from apt_evap.specimen.symmetry import point_group
 
 SCALE, WIDTH = 60.0, 70.0
 ELEMENTS = {"fcc": "Ni", "bcc": "W", "diamond": "Si", "hcp": "Ti"}

@@ -5,8 +5,8 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
+from apt_evap.specimen.symmetry import point_group
 
 
 @pytest.fixture(scope="module")

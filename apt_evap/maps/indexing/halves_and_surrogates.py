@@ -22,13 +22,13 @@ import numpy as np
 import scipy
 
 from apt_evap._common.types import Floats
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.contrast_search import PIECES, Terms, exact_evidence, places_of, refine_contrast
 from apt_evap.maps.indexing.joint_search import JOINT, JointSearch
 from apt_evap.maps.indexing.master_pattern import sampled
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Start, about_axis, axes_of, polar_grid
 from apt_evap.maps.indexing.refine import Refined, directions_of, refine
 from apt_evap.maps.indexing.two_criteria import View
+from apt_evap.specimen.symmetry import point_group
 
 HALVES = 8
 """Half discs, 45 degrees apart."""

@@ -14,8 +14,8 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.noise import effective_ions
+from apt_evap.specimen.symmetry import point_group
 
 RINGS, AZIMUTHS = 20, 96
 """Points of a polar picture."""

@@ -54,7 +54,7 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
 
     Examples
     --------
-    >>> from apt_evap.maps.crystallography.symmetry import pole_symmetry
+    >>> from apt_evap.specimen.symmetry import pole_symmetry
     >>> for direction in ((0, 0, 1), (1, 1, 1), (0, 1, 1), (1, 1, 3), (1, 2, 3)):
     ...     print(pole_symmetry(ae.material("Ni"), direction).name)
     4mm
