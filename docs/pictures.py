@@ -17,7 +17,7 @@ import numpy as np
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples"

@@ -13,6 +13,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every proce
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+if sys.dont_write_bytecode:  # otherwise every worker and every program of a test compiles all sources
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
@@ -26,10 +31,10 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import replace_file
-from apt_evap._common.locks import FileLock
 from apt_evap.explore import measured_ions
 from apt_evap.io import measured_file
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.simulation.locks import FileLock
 from apt_evap.spectra import mass_spectrum
 from apt_evap.spectra.mass_spectrum import spectrum
 

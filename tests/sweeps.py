@@ -9,7 +9,7 @@ import threading
 from pathlib import Path
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.run import load
 from apt_evap.studies.sweep.planning import plan_sweep
 from apt_evap.studies.sweep.point_folder import run_point

@@ -73,11 +73,6 @@ def check_array(
         Type of the result; a conversion that loses a fraction or a sign is an error.
     finite : bool
         Whether NaN and infinities are errors.
-
-    Raises
-    ------
-    ValueError
-        Names the argument, its value and the expected type and shape.
     """
     value = without_mask(value, name, dtype)
     expected_shape = "(" + ", ".join(str(length) for length in shape) + ("," if len(shape) == 1 else "") + ")"

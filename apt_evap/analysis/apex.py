@@ -1,4 +1,4 @@
-"""Shape of the cap, image compression and field factor, from the ions of a run."""
+"""Shape of the cap and image compression, from the ions of a run."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ import numpy as np
 import scipy
 
 from apt_evap._common.short_repr import short_repr
-from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_sequence
 from apt_evap.detection.projection import Projection, polar_angles
 from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.simulation.run import Run
 
 _CAP = math.radians(45)  # sites within this angle of the axis define the sphere: far from the shank
-_NEAR = math.radians(20)  # angle around the apex for its field
 _BIN = 2.0  # degrees
 _LEAST_IONS = 30  # fewest ions for the median of a bin
 _INNER = 15.0  # [degrees]: inside this angle a pole on the axis deflects its ions outwards
@@ -159,43 +157,6 @@ def image_compression(run: Run, caps: Sequence[FittedCap] | None = None) -> Imag
     scatter = float(np.diff(np.percentile(ratio, [16, 84]))[0] / 2)
     projection = onto_detector.compressed(compression)
     return ImageCompression(compression, scatter, low, high, angles, medians, projection)
-
-
-def field_factor(run: Run, caps: Sequence[FittedCap] | None = None) -> Floats:
-    """Determine the field factor of a run from the fields at evaporation.
-
-    Parameters
-    ----------
-    run : Run
-        The ions.
-    caps : sequence of FittedCap, optional
-        Spheres with the radii of the apex; by default those of `fit_caps`.
-
-    Returns
-    -------
-    ndarray
-        Field factor k_f = V / (R F) of each cap, shape (n,): 1 for a free sphere, 2 to 8 for specimens with a shank in
-        front of an electrode. F is the median field just before evaporation of the atoms within 20 degrees of the
-        axis. These atoms are at the edges of terraces, where the field is higher than the mean over the cap. So the
-        factor is smaller than a factor from the mean field.
-
-    Raises
-    ------
-    ValueError
-        If a cap has no ion near the axis.
-
-    Notes
-    -----
-    Gomer, Field Emission and Field Ionization (1961).
-    """
-    factors = []
-    for cap in _caps_of(run, caps):
-        from_centre = run.emissions.positions[cap.first : cap.last] - cap.centre
-        near = polar_angles(from_centre) < _NEAR
-        if not near.any():
-            raise ValueError(f"none of the ions {cap.first} to {cap.last} is within 20 degrees of the axis")
-        factors.append(run.voltage / (cap.radius * np.median(run.fields[cap.first : cap.last][near])))
-    return np.array(factors)
 
 
 def _caps_of(run, caps):

@@ -341,11 +341,6 @@ def ion_charges(hits: Hits, element: str, ranges: Ranges | None = None) -> Integ
     -------
     ndarray of int64, shape (n,)
         Charge [e]; 0 for an ion in no range of the element.
-
-    Raises
-    ------
-    ValueError
-        If the charges are not known, the ions are of other elements, or a range is not at an isotope of the element.
     """
     check_kind(hits, "hits", Hits, "Hits")
     check_kind(element, "element", str, "a chemical symbol such as 'Ni'")
@@ -400,11 +395,6 @@ def field_of_counts(element: str, charge: int, lower: ArrayLike, upper: ArrayLik
         Field on the scale of Kingham's curves [V/nm].
     error : ndarray
         Standard error [V/nm]: half the difference of the fields at ln(ratio) plus and minus its error.
-
-    Raises
-    ------
-    ValueError
-        If the fit has no such element or charge.
     """
     if element not in RATIO_PARAMETERS:
         raise ValueError(

@@ -10,7 +10,7 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.binning import find_quantisations
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.io.ion_blocks import IonBlocks
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.orientation_check import apex_sphere, depths, pointing, upright
 from apt_evap.specimen.tip import Tip

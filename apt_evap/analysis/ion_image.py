@@ -101,11 +101,6 @@ def tunnel_factor(field: ArrayLike, ionisation_energy: float) -> Any:
     float or ndarray
         Of the shape of `field`. 1 if the field removes the barrier.
 
-    Raises
-    ------
-    ValueError
-        If a field or the energy is not positive.
-
     Notes
     -----
     .. math:: D = \exp\left[-\frac{6.831 \, I^{3/2}}{F} \sqrt{1 - 2.40 \, \sqrt{F} / I}\right]

@@ -16,9 +16,9 @@ from apt_evap._common.validation import check_kind, check_sequence
 from apt_evap.analysis.apex import image_compression
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, sampled
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.symmetry import point_group
 
 _WIDEST = 50.0  # degrees from the axis of the tip: farther out are ions from the shank
 _ROUNDS = 6  # of density and decrease in turn: the last changes are below 0.1 %

@@ -48,11 +48,6 @@ def evaporation_fields(run: Run) -> Floats:
 def evaporation_voltages(run: Run) -> Floats:
     r"""Voltage at which each ion of a run reaches its evaporation field.
 
-    Parameters
-    ----------
-    run : Run
-        The ions, simulated at one voltage.
-
     Returns
     -------
     ndarray
@@ -80,11 +75,6 @@ def smoothed_history(values: ArrayLike, points: int = 200) -> SmoothedHistory:
         A quantity of each ion, shape (n,), in the order of evaporation.
     points : int
         Number of sections k; n if there are fewer values.
-
-    Raises
-    ------
-    ValueError
-        If there are no values, or points is not an integer >= 1.
     """
     values = check_array(values, "values", ("n",), finite=False)
     points = check_count(points, "points", at_least=1)

@@ -9,9 +9,6 @@ import numpy as np
 
 from apt_evap._common.codec import declared, to_python
 from apt_evap.cli._files import file_of, in_real_units, lens_of, read, read_registration
-from apt_evap.config.material_text import read_material
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
 from apt_evap.explore.explorer import Explorer, ExplorerSettings
@@ -19,6 +16,9 @@ from apt_evap.explore.measured_ions import MeasuredIons
 from apt_evap.fit.measured_map import measured_map
 from apt_evap.fit.start_settings import is_start, registration_start_of
 from apt_evap.io.measured_file import MeasuredFile
+from apt_evap.simulation.config.material_text import read_material
+from apt_evap.simulation.config.perturbation_text import read_perturbation
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.materials import MATERIALS

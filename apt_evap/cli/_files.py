@@ -10,13 +10,13 @@ from apt_evap._common.codec import declared, from_plain
 from apt_evap._common.files import FileError, read_small_file
 from apt_evap.cli._output import say
 from apt_evap.cli._progress import reading_progress
-from apt_evap.config.lens_text import read_lens
-from apt_evap.config.material_text import read_material
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.config.lens_text import read_lens
+from apt_evap.simulation.config.material_text import read_material
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES

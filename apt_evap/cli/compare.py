@@ -127,8 +127,8 @@ def _file(options):
 def _measured(options):
     """Ions or a map of MEASURED; the ions of a run under a perturbation."""
     from apt_evap.cli._files import file_of, note, read
-    from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.detector_map import DetectorMap
+    from apt_evap.simulation.config.perturbation_text import read_perturbation
     from apt_evap.simulation.run import Run
 
     content = read(options)

@@ -38,7 +38,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap.cli._shipped import settings_file
-    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.simulation.config.cost_estimate import hours_text
     from apt_evap.studies.dataset.making import make_dataset, plan_dataset
     from apt_evap.studies.dataset.set_description import ABOUT, verify_dataset
 

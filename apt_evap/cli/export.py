@@ -89,8 +89,8 @@ def _written_in_blocks(output, options):
 def _ions(content, options):
     """Ions of a run for the options, or measured ones."""
     from apt_evap.cli._files import in_real_units
-    from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.hits import Hits
+    from apt_evap.simulation.config.perturbation_text import read_perturbation
     from apt_evap.simulation.run import Run
 
     if isinstance(content, Run):

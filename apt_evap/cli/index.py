@@ -58,8 +58,8 @@ def execute(options: argparse.Namespace) -> int:
 
 def indexed(measured: Any, options: argparse.Namespace) -> Any:
     """Index measured ions or a map by the options."""
-    from apt_evap.config.material_text import read_material
     from apt_evap.maps.indexing.index_map import index
+    from apt_evap.simulation.config.material_text import read_material
 
     return index(
         measured,

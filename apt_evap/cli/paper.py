@@ -41,7 +41,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command; finished runs are not repeated."""
     from apt_evap.cli._files import measured_source
     from apt_evap.cli._progress import run_progress
-    from apt_evap.config.material_text import read_material
+    from apt_evap.simulation.config.material_text import read_material
     from apt_evap.workflows.figures_of_paper import paper
 
     if (options.file is None) != (options.element is None):

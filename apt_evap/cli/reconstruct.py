@@ -263,10 +263,10 @@ def _tell_check(options, reconstruction, material, axis, assumed):
 def _ions(options, output):
     """Ions of the file, the constants that it determines, and the orientation of a run."""
     from apt_evap.cli._files import in_real_units, read
-    from apt_evap.config.perturbation_text import read_perturbation
     from apt_evap.detection.hits import Hits
     from apt_evap.maps.crystallography.orientation import Orientation
     from apt_evap.reconstruction.constants import run_constants
+    from apt_evap.simulation.config.perturbation_text import read_perturbation
     from apt_evap.simulation.run import Run
 
     if (content := _ions_of_large_file(options, output)) is None:
@@ -327,7 +327,7 @@ def _field(options):
 
 def _element(text):
     from apt_evap._common.files import FileError
-    from apt_evap.config.material_text import read_material
+    from apt_evap.simulation.config.material_text import read_material
 
     try:
         return read_material(text, "--element")

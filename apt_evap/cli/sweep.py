@@ -64,7 +64,7 @@ def execute(options: argparse.Namespace) -> int:
 
 def _plan(options):
     from apt_evap._common.codec import to_plain
-    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.simulation.config.cost_estimate import hours_text
     from apt_evap.studies.sweep.planning import plan_sweep
 
     sweep = plan_sweep(options.study)
@@ -142,7 +142,7 @@ def _status(options):
 
 
 def _tell_counts(options, content):
-    from apt_evap.config.cost_estimate import hours_text
+    from apt_evap.simulation.config.cost_estimate import hours_text
     from apt_evap.studies.sweep.point_folder import STATES
 
     counts = content["counts"]

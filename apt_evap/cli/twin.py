@@ -42,7 +42,7 @@ def execute(options: argparse.Namespace) -> int:
     """Run the command; finished steps are not repeated."""
     from apt_evap.cli._files import measured_source
     from apt_evap.cli._progress import run_progress
-    from apt_evap.config.material_text import read_material
+    from apt_evap.simulation.config.material_text import read_material
     from apt_evap.workflows.twin_of_map import twin
 
     twin(

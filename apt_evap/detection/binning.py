@@ -26,7 +26,7 @@ class Quantisation(NamedTuple):
     origin: float
 
 
-def find_quantisation(values: Floats, sample: int = 100_000) -> Quantisation | None:
+def find_quantisation(values: Floats) -> Quantisation | None:
     """Find the quantisation of coordinates, if there is one.
 
     The gaps between the sorted distinct values, divided by the smallest gaps and rounded, give the integer k of each
@@ -35,9 +35,7 @@ def find_quantisation(values: Floats, sample: int = 100_000) -> Quantisation | N
     Parameters
     ----------
     values : ndarray
-        Coordinates along one axis [mm], shape (n,).
-    sample : int
-        Number of values in the evenly spaced sample.
+        Coordinates along one axis [mm], shape (n,); about 100,000 of them, evenly spaced, are looked at.
 
     Returns
     -------
@@ -45,7 +43,7 @@ def find_quantisation(values: Floats, sample: int = 100_000) -> Quantisation | N
         None if few values repeat, if the RMS deviation from the line exceeds a tenth of the spacing, or if the spacing
         is only the rounding of the floating point type.
     """
-    values = values[:: max(1, len(values) // sample)]
+    values = values[:: max(1, len(values) // 100_000)]
     levels = np.unique(values)
     rounding = float(np.spacing(np.abs(levels).max())) if len(levels) else 0.0
     levels = levels.astype(np.float64)
@@ -127,11 +125,6 @@ def bin_edges(
     -------
     x_edges, y_edges : ndarray
         Edges [mm].
-
-    Raises
-    ------
-    ValueError
-        If `bins` or `extent` is invalid.
     """
     bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if extent is None:

@@ -10,11 +10,6 @@ from apt_evap.detection.detector_map import DetectorMap
 def color_limits(map: DetectorMap) -> tuple[float, float]:
     """Robust limits of a colour scale: the 0.5 and 99.5 percentiles of the density inside the detector.
 
-    Parameters
-    ----------
-    map : DetectorMap
-        The map.
-
     Returns
     -------
     tuple of float
@@ -28,11 +23,6 @@ def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
     """Common limits of a colour scale for several maps: the 0.5 and 99.5 percentiles of all densities.
 
     The lower limit becomes 0 if it is less than 1/20 of the upper one.
-
-    Parameters
-    ----------
-    maps : sequence of DetectorMap
-        The maps.
 
     Returns
     -------

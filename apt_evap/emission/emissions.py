@@ -175,11 +175,6 @@ def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) ->
         Each of all n ions.
     chosen : ndarray of int, shape (n,)
         Which one of them each ion has.
-
-    Returns
-    -------
-    TangentialLaunches
-        Shares and heights are left at their default if all have it.
     """
     n = len(chosen)
     defaults = {"shares": np.tile([1.0, 0.0, 0.0], (n, 1)), "heights": np.zeros(n)}

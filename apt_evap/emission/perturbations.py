@@ -125,19 +125,7 @@ class _Tangential:
         return to_python(self, "", few_digits)
 
     def launch(self: TangentialPerturbation, emissions: Emissions, random: IonRandom) -> Launches:
-        """Launch a batch of ions.
-
-        Parameters
-        ----------
-        emissions : Emissions
-            A batch of n.
-        random : IonRandom
-            Random numbers of these ions.
-
-        Returns
-        -------
-        Launches
-        """
+        """Launch a batch of ions."""
         return launch_tangentially(emissions, *self.tangential(emissions, random))
 
     def _heights(self, n):

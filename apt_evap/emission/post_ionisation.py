@@ -183,11 +183,6 @@ def charge_probabilities(element: str, field: ArrayLike, least: int = 1) -> Floa
         Probabilities of the charges `least`, `least` + 1, ... up to the highest of the fit, shape (n, k). Each row has
         the sum 1.
 
-    Raises
-    ------
-    ValueError
-        If the fit has no such element or charge, or a field is not finite.
-
     Notes
     -----
     p(n) is proportional to the product of the ratios CSR(m) of the charges m from `least` to n - 1.

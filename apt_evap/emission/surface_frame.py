@@ -171,11 +171,6 @@ def target_shares(emissions: Emissions, sharpness: float) -> Floats:
     ndarray, shape (n, 3)
         0 for missing neighbours; the first is 1 for an atom without any.
 
-    Raises
-    ------
-    ValueError
-        If the emissions have no targets.
-
     Notes
     -----
     .. math:: w_j \propto \exp\left(\frac{q_j / q_1 - 1}{\tau}\right)

@@ -299,13 +299,6 @@ class BondCodes(NamedTuple):
 def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
     """Codes of the bonds of a specimen, and the factor of 1/field for every code.
 
-    Parameters
-    ----------
-    bonds : BondField
-        Evaporation field by bonds.
-    tip : Tip
-        The specimen.
-
     Returns
     -------
     codes : BondCodes
@@ -314,11 +307,6 @@ def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
         Evaporation field of the species divided by that with these bonds.
     species : ndarray of int32, shape (n_atoms,)
         Species of each atom.
-
-    Raises
-    ------
-    ValueError
-        If there are too many species, or a field is not a positive number.
     """
     n_kinds = len(tip.elements) if bonds.by_species else 1
     n_counts = n_kinds * (2 if bonds.second_shell else 1)

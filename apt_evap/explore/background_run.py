@@ -10,9 +10,9 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.search_process import sentence_of
 from apt_evap.simulation.checkpoint import Checkpoint
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import ResponseWarning
 

@@ -4,9 +4,9 @@ import shlex
 from typing import Any, NamedTuple
 
 from apt_evap._common.codec import to_python
-from apt_evap.config.perturbation_text import write_perturbation
 from apt_evap.detection.hits import Hits
 from apt_evap.explore.explorer_maps import ExplorerSettings
+from apt_evap.simulation.config.perturbation_text import write_perturbation
 
 
 class Commands(NamedTuple):

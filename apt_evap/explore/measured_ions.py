@@ -41,14 +41,6 @@ class IonSelection:
 class MeasuredIons:
     """Measured ions and their selection.
 
-    Parameters
-    ----------
-    hits : Hits
-        All ions of the file.
-    file : MeasuredFile, optional
-        How they were read, and which of them are shown at the start; by default all. Its flight length and time zero
-        are for ions with times of flight and no masses.
-
     Raises
     ------
     ValueError

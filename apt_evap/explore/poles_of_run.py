@@ -15,11 +15,11 @@ from apt_evap.fit.confirmation import confirmed
 from apt_evap.fit.structure import PoleMeasure, RegisteredProjection
 from apt_evap.maps.crystallography.directions import poles
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import pole_symmetry
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.maps.rings import Ring, ring_statistics
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.symmetry import pole_symmetry
 
 _FAMILIES = 6  # of poles over the maps
 _NEAR = 15.0  # degrees: a pole farther from the axis of the specimen is not that of its apex

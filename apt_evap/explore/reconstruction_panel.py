@@ -45,21 +45,7 @@ _BINS = 96
 
 
 class ReconstructionPanel:
-    """Widgets of the reconstruction.
-
-    Parameters
-    ----------
-    explorer : Explorer
-        The run, whose ions are reconstructed if there is one, or the measured ions.
-    perturbation : callable
-        Returns the emission of the ions of the run.
-    spectrum : callable or None
-        Returns the spectrum of the measured ions, whose ranges give their species.
-    material : callable
-        Returns the name of the crystal, which gives the volume of an atom; "" if it is not known.
-    later : callable
-        As for `Page`.
-    """
+    """Widgets of the reconstruction."""
 
     def __init__(
         self,

@@ -54,11 +54,6 @@ class RegistrationSearch:
             that it raises ends the search.
         apply : callable, optional
             Calls a function with a tuple of arguments, such as `SearchProcess.call`.
-
-        Raises
-        ------
-        ValueError
-            If there are no perturbations, or as in `register` for all of them.
         """
         call = apply or (lambda function, arguments, options={}, progress=None: function(*arguments, **options))
         best: Registration | None = None

@@ -44,21 +44,7 @@ _OF_MASS = "ions of a range"
 
 
 class SpectrumPanel:
-    """Spectrum, and the widgets that select ions.
-
-    Parameters
-    ----------
-    ions : MeasuredIons
-        The measured ions.
-    name : str
-        File of the measurement.
-    selected : callable
-        Called after the selection has changed.
-    crystal : callable
-        Receives the element of most ions.
-    later : callable
-        As for `Page`.
-    """
+    """Spectrum, and the widgets that select ions."""
 
     def __init__(
         self,

@@ -137,13 +137,7 @@ def ranges_near(path: str) -> list[str]:
 
 
 def measurement_of(ranges: str) -> str:
-    """The measurement of a file of ranges: that of its name, or the only one of its folder.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or several.
-    """
+    """The measurement of a file of ranges: that of its name, or the only one of its folder."""
     found = [each for each in sorted(Path(ranges).parent.glob("*")) if each.suffix.lower() in MEASUREMENTS[:-1]]
     same = [each for each in found if each.stem == Path(ranges).stem]
     if len(same or found) != 1:

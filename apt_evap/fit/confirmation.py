@@ -54,11 +54,6 @@ def confirmed(likeness: Likeness, simulated: Structure | None, measured: Structu
 def lines_of_other_sign(simulated: Structure, measured: Structure) -> Sequence[tuple[float, float]]:
     """Rings with a significant measured contrast in which bright lines are dark, or dark ones bright.
 
-    Parameters
-    ----------
-    simulated, measured : Structure
-        Structure about the same pole.
-
     Returns
     -------
     list of (float, float)

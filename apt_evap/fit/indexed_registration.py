@@ -12,11 +12,11 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.index_map import LEAST_IONS, Indexing, index
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration, at_bound, register, register_points
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.symmetry import point_group
 from apt_evap.warnings import RegistrationWarning, WorkflowWarning, warn
 
 ENERGY, HEIGHT, SHARPNESS = 0.35, 0.1, 0.4
@@ -98,11 +98,6 @@ def indexed_start(run: Run, indexing: Indexing) -> dict[str, Any]:
     -------
     dict
         As for `registration_start`.
-
-    Raises
-    ------
-    ValueError
-        If the run has no crystal or too few ions, or its axis is not on the map.
     """
     crystal, best = Orientation.known(run.settings["tip"]), indexing.best
     if crystal is None:
@@ -148,10 +143,6 @@ def emission_of_pattern(rolled: float, height: float = HEIGHT) -> Perturbation:
         Fraction of the ions that roll up, of a `Candidate`; below 0.1 all leave with lateral velocities.
     height : float
         Largest height of the start that the run permits [nm].
-
-    Returns
-    -------
-    RollUp or LateralVelocity
     """
     height = min(height, HEIGHT)
     return RollUp(ENERGY, rolled, SHARPNESS, height) if rolled >= ROLLS else LateralVelocity(ENERGY, height)
@@ -168,11 +159,6 @@ def register_near(hits: Hits, measured: DetectorMap, bounds: dict[str, Any]) -> 
         The measured map.
     bounds : dict
         Result of `registration_start` or `indexed_start`.
-
-    Raises
-    ------
-    ValueError
-        If the simulated map covers less than half of the measured one.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RegistrationWarning)

@@ -67,17 +67,6 @@ def measured_map(measured: Hits | DetectorMap, bins: int | None = None) -> Detec
 def bins_for_run(run: Run, measured: DetectorMap, registration: Registration, merged: bool) -> int | None:
     """Bins along the longer side with enough ions of a run in each, None for the bins of the map.
 
-    Parameters
-    ----------
-    run : Run
-        The run.
-    measured : DetectorMap
-        The measured map.
-    registration : Registration
-        From the run into its frame.
-    merged : bool
-        Whether bins of the map can only be merged by an integer factor, as its ions are not known.
-
     Returns
     -------
     int or None

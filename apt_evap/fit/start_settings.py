@@ -17,11 +17,6 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap._common.version import __version__
-from apt_evap.config.cost_estimate import CostEstimate, estimate_cost, hours_text
-from apt_evap.config.material_text import material_value
-from apt_evap.config.perturbation_text import write_perturbation
-from apt_evap.config.simulation_file import config_of
-from apt_evap.config.toml_text import comment
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
@@ -30,6 +25,11 @@ from apt_evap.emission.roll_probability import Migration
 from apt_evap.fit.indexed_registration import ENERGY, HEIGHT, ROLLS, SHARPNESS, registration_start
 from apt_evap.maps.indexing.index_map import Indexing
 from apt_evap.maps.indexing.orientation_search import disc_of
+from apt_evap.simulation.config.cost_estimate import CostEstimate, estimate_cost, hours_text
+from apt_evap.simulation.config.material_text import material_value
+from apt_evap.simulation.config.perturbation_text import write_perturbation
+from apt_evap.simulation.config.simulation_file import config_of
+from apt_evap.simulation.config.toml_text import comment
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
 
@@ -122,22 +122,10 @@ def is_start(path: AnyPath) -> bool:
 def registration_start_of(path: AnyPath, measured: DetectorMap) -> dict[str, Any]:
     """Return `registration_start` of a run, read from its settings file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        Settings file that `is_start`.
-    measured : DetectorMap
-        The measured map.
-
     Returns
     -------
     dict
         Empty if the settings were not made from the file of the map, as it is now.
-
-    Raises
-    ------
-    ValueError
-        If the file contains no such settings, or the map no field of view.
     """
     with open_for_reading(path) as file:
         text = file.read().decode()
@@ -208,7 +196,7 @@ def settings_of(
     >>> measured = pattern.map(truth, ae.detection.Projection(60.0), width=70.0, ions=20_000, seed=1)
     >>> start = ae.fit.settings_of(ae.index(measured, "W", scales=(58, 62)), minutes=1)
     >>> start.save("w.toml")
-    >>> from apt_evap.config.simulation_file import read_config
+    >>> from apt_evap.simulation.config.simulation_file import read_config
     >>> read_config("w.toml").tip["material"].name
     'W'
     """

@@ -22,7 +22,6 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.directions import plain_label, plane_normals, poles
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import pole_symmetry
 from apt_evap.maps.folded_map import FoldedMap, folded, symmetric_cells
 from apt_evap.maps.pole_frame import pole_frame
 from apt_evap.maps.pole_profiles import pole_profile
@@ -30,6 +29,7 @@ from apt_evap.maps.profiles import Profile
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.rings import RINGS, LineAmplitude, Ring, line_amplitude, ring_statistics
 from apt_evap.simulation.run import Run
+from apt_evap.specimen.symmetry import pole_symmetry
 
 LOST = 0.5
 """A ring has lost its structure if its contrast is below this fraction of the measured one."""

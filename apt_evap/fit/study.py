@@ -400,17 +400,7 @@ def bounded_text(
     open_ends: Sequence[bool] | None = None,
     factor: float = 1.0,
 ) -> str:
-    """Text of a number and its interval with the digits that it allows; open ends are "at most" and "at least".
-
-    Parameters
-    ----------
-    value : float
-        The number.
-    interval, open_ends : sequence, optional
-        Its lower and upper bound, and whether each of them is at an end of the grid.
-    factor : float
-        Of all numbers.
-    """
+    """Text of a number and its interval with the digits that it allows; open ends are "at most" and "at least"."""
     if interval is None or interval[0] == interval[1]:  # not known, or given
         return f"{value * factor:.3g}"
     low, high = (bound * factor for bound in interval)

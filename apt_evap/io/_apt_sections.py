@@ -34,30 +34,7 @@ class Section:
 
 
 def read_sections(file: BinaryIO, path: AnyPath, partial: bool) -> tuple[int, list[Section]]:
-    """Read the headers of an .apt file.
-
-    Parameters
-    ----------
-    file : file
-        Open for reading bytes.
-    path : str or path-like
-        For messages.
-    partial : bool
-        Skip an incomplete last section with a warning; otherwise it is an error.
-
-    Returns
-    -------
-    n : int
-        Number of ions.
-    sections : list of Section
-
-    Raises
-    ------
-    FileError
-        If the file is damaged or contains no ion.
-    TruncatedFile
-        If it ends in the middle of a section and `partial` is False, or before the end of the first one.
-    """
+    """Read the headers of an .apt file."""
     size = os.fstat(file.fileno()).st_size
     if size == 0:
         raise FileError(f"{str(path)!r} is empty (0 bytes), expected an .apt file, beginning with {SIGNATURE!r}")

@@ -17,13 +17,6 @@ _NAMES = {"x": "detector_x", "y": "detector_y"}
 def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats, dict[str, NDArray[Any]]]:
     """Positions and other columns of the ions to write.
 
-    Parameters
-    ----------
-    path : str or path-like
-        For messages.
-    hits : Hits
-        Ions with positions. Ions without finite positions are left out, and a warning gives their number.
-
     Returns
     -------
     chosen : ndarray or slice
@@ -33,11 +26,6 @@ def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats
     data : dict of ndarray
         Other columns by name, with the columns of `extra` that are numbers or texts. Detector coordinates are called
         detector_x and detector_y.
-
-    Raises
-    ------
-    ValueError
-        If there are no positions, or none is finite.
     """
     (positions,) = hits.require("positions")
     finite = np.isfinite(positions).all(axis=1)

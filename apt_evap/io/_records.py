@@ -137,13 +137,6 @@ def open_words(
     Yields
     ------
     Words
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty, of another kind by its first bytes, or in the wrong byte order.
-    TruncatedFile
-        If the size is not a multiple of `row_size` and `partial` is False.
     """
     check_switch(partial, "partial")
     if byte_order is not None:
@@ -193,11 +186,6 @@ def check_columns(columns: str | Sequence[str] | None, available: Sequence[str],
     Returns
     -------
     tuple of str
-
-    Raises
-    ------
-    FileError
-        Names an unavailable column and the available ones.
     """
     if columns is None:
         return tuple(available)
@@ -318,11 +306,6 @@ def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None
         Bytes per ion.
     chosen : ndarray or slice
         Selection of the ions to write.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
     """
     with replace_file(path) as file:
         put_words(file, columns, row_size, chosen)

@@ -43,16 +43,6 @@ def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
         Expected content, for messages.
     at_most : int
         Largest allowed size [bytes], also after decompression.
-
-    Returns
-    -------
-    bytes
-        Without a byte order mark.
-
-    Raises
-    ------
-    FileError
-        If it is missing, unreadable, empty, too large, compressed in another way, or expands more than 200 times.
     """
     data = read_small_file(path, at_most, what)
     if not data:
@@ -432,19 +422,6 @@ def species_name(word: str, known: Collection[str], where: str) -> str:
 
     The text itself if it is one of the names in the file, otherwise the only one that differs in case, a formula such
     as "CO", or a chemical symbol in upper or lower case: "CO" is never cobalt if the file has both.
-
-    Parameters
-    ----------
-    word : str
-        Text in the file.
-    known : collection of str
-        Names that the file lists.
-    where : str
-        File and line, for a warning.
-
-    Returns
-    -------
-    str
 
     Warns
     -----

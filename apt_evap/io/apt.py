@@ -64,28 +64,12 @@ def read_apt(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bo
     those with an unknown unit, are stored unchanged in ``extra`` under their own names, with their units in ``units``.
     Upper or lower case of names and units does not matter. A second section with the same name is called "name (2)".
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Columns of `Hits` and names of sections to read; only these are kept in memory. All by default.
-    partial : bool
-        Read the complete sections of a file that ends in the middle of a section.
-
     Returns
     -------
     Hits
         `pulse_id` and `multiplicity` are computed from Multiplicity, which may contain the number of ions of a pulse
         for all its ions, or for the first ion only, with 0 for the others. Otherwise it is stored in ``extra``, with a
         warning.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, damaged or contains no ion, or has no such column.
-    TruncatedFile
-        If it ends in the middle of a section and `partial` is False.
     """
     with _open(path, columns, partial) as (file, n, chosen, grouping):
         ions = _ions(file, path, grouping, n) if grouping else None
@@ -102,11 +86,6 @@ def chunk_apt(
     Yields
     ------
     Hits
-
-    Raises
-    ------
-    ValueError
-        If `rows` is less than the number of ions of one pulse.
     """
     with _open(path, columns, partial, chunks=True) as (file, n, chosen, grouping):
         ions = _ions(file, path, grouping, n) if grouping else None

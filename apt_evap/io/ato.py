@@ -25,28 +25,7 @@ _NM_PER_ANGSTROM = np.float32(0.1)
 
 
 def read_ato(path: AnyPath, *, columns: Sequence[str] | None = None, partial: bool = False) -> Hits:
-    """Read the positions and masses of an .ato file of version 3.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns of `Hits` to read: "positions" and "mass_to_charge", by default both.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-
-    Returns
-    -------
-    Hits
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or empty, is of another version, or has no such column.
-    TruncatedFile
-        If it ends in the middle of an ion and `partial` is False.
-    """
+    """Read the positions and masses of an .ato file of version 3."""
     check_switch(partial, "partial")
     chosen = check_columns(columns, ("positions", "mass_to_charge"), path)
     with open_for_reading(path) as file:

@@ -74,23 +74,6 @@ def read_csv(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
     or a comment just before the numbers, names the columns, with units such as "x [mm]", "m/n (Da)" or "tof_ns". With
     x, y and z, these are positions [nm]; x and y alone are detector coordinates [mm]. Four columns without names are x,
     y, z [nm] and m/n [Da]. Other columns become further columns with their names.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; all by default.
-
-    Returns
-    -------
-    Hits
-
-    Raises
-    ------
-    FileError
-        If the file is missing or larger than 1 GB, has no numbers or no names that are known, or a unit is not known; a
-        line that cannot be read is named.
     """
     table = read_table(path, "a table of ions", _LARGEST)
     known = {*_KNOWN, *_INTEGERS, "z"}
@@ -198,21 +181,10 @@ def write_csv(path: AnyPath, hits: Hits, *, decimals: int | None = None, separat
 
     Parameters
     ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions.
     decimals : int, optional
         Digits after the point, 0 to 17; by default as many as restore the exact values.
     separator : {"comma", "semicolon", "tab"}
         What divides the columns.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
-    ValueError
-        If an option has another value.
     """
     divider = SEPARATORS[check_choice(separator, "separator (--separator)", SEPARATORS)]
     if decimals is not None and check_count(decimals, "decimals (--decimals)", at_least=0) > _MOST_DECIMALS:

@@ -29,21 +29,11 @@ _NM3_PER_CUBIC_ANGSTROM = 1e-3
 def read_env(path: AnyPath) -> Ranges:
     """Read the mass ranges of an .env file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     Ranges
         In the order of the file. The composition is that of a formula such as "Mn2O", or of an isotope such as "Mg26";
         it is empty for any other name.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or unreadable, or has no ranges.
 
     Warns
     -----

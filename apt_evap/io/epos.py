@@ -13,6 +13,7 @@ from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.io._pulses import (
     EveryCheck,
     PulseCheck,
@@ -32,7 +33,6 @@ from apt_evap.io._records import (
     tell_omitted,
     write_words,
 )
-from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.warnings import DataWarning, warn
 
 _ROW = 44
@@ -72,33 +72,11 @@ def read_epos(
     coordinates if both are zero. A pulse voltage of zero is read if there is a standing voltage (laser pulsing). The
     column of pulses since the last event is read even if it is zero, and is not used to group ions.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns of `Hits` to read; only these are kept in memory. All by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads big-endian and checks the byte order.
-    voltage_unit : {None, "V", "kV"}
-        Unit of the voltages in the file. By default V, or kV if all voltages are below 100, with a warning.
-    detector_unit : {"mm", "cm", "m", "um"}
-        Unit of the detector coordinates in the file; some programs write cm.
-
     Returns
     -------
     Hits
         `pulse_id` and `multiplicity` are computed from the last column alone: the number of ions of a pulse for its
         first ion and 0 for the others, or for all of them. If it is inconsistent, they are None, with a warning.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
-    TruncatedFile
-        If the size is not a multiple of 44 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     survey = _Survey(voltage_unit, detector_unit)
@@ -129,11 +107,6 @@ def chunk_epos(
     Yields
     ------
     Hits
-
-    Raises
-    ------
-    ValueError
-        If `rows` is less than the number of ions of one pulse.
     """
     chosen, _ = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     blocks = EposBlocks(
@@ -321,20 +294,6 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
     consecutive ions with the same `pulse_id` are one pulse. Each simulated ion without `pulse_id` is one pulse. The
     format does not contain the unit of the voltages: if all are below 100 V, a warning says that they can be taken for
     kV.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions.
-
-    Raises
-    ------
-    ValueError
-        If there is no ion to write.
-    FileError
-        If the file cannot be written.
     """
     columns, further = _written(hits)
     chosen = choose(path, hits, columns)
@@ -347,13 +306,7 @@ def write_epos(path: AnyPath, hits: Hits) -> None:
 
 
 def write_epos_blocks(path: AnyPath, ions: IonBlocks) -> int:
-    """Write the detected ions of a large file as `write_epos` does, block by block; return the number of detected ions.
-
-    Raises
-    ------
-    ValueError, FileError
-        As for `write_epos`.
-    """
+    """Write the detected ions of a large file as `write_epos` does, block by block; return their number."""
     with replace_file(path) as file:
         writer = ions.fed(lambda: BlockWriter(file, _ROW, _written))
         tell_omitted(path, writer.detected, 0, writer.detected - writer.written)

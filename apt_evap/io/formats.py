@@ -17,6 +17,7 @@ from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_kind, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import ROWS, Field, IonBlocks
 from apt_evap.io._apt_sections import SIGNATURE
 from apt_evap.io._points import is_data
 from apt_evap.io._texts import read_head, read_text, without_compression
@@ -26,7 +27,6 @@ from apt_evap.io.csv import read_csv, write_csv
 from apt_evap.io.env import read_env
 from apt_evap.io.epos import WRITTEN as EPOS
 from apt_evap.io.epos import EposBlocks, chunk_epos, read_epos, write_epos, write_epos_blocks
-from apt_evap.io.ion_blocks import ROWS, Field, IonBlocks
 from apt_evap.io.npz import read_map
 from apt_evap.io.pos import WRITTEN as POS
 from apt_evap.io.pos import PosBlocks, chunk_pos, read_pos, write_pos, write_pos_blocks
@@ -242,11 +242,6 @@ def ion_blocks(
     IonBlocks or None
         None for a file that is to be read whole: smaller than `LARGE`, of another format than .epos and .pos, without
         one of these columns, or with a pulse that is larger than a block.
-
-    Raises
-    ------
-    FileError
-        As for `read`.
     """
     chosen = format_of(path, format)
     if chosen.blocks is None or os.stat(check_path(path)).st_size < LARGE:
@@ -392,24 +387,12 @@ def write(path: AnyPath, hits: Hits, *, format: str | None = None, **options: An
 def write_blocks(path: AnyPath, ions: IonBlocks) -> tuple[int, tuple[str, ...], tuple[str, ...]]:
     """Write the detected ions of a large file block by block, with the same bytes as `write`.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file, .pos or .epos.
-    ions : IonBlocks
-        All ions.
-
     Returns
     -------
     detected : int
         Number of detected ions.
     left_out, zeros : tuple of str
         As of `left_out`.
-
-    Raises
-    ------
-    FileError, ValueError
-        As for `write`.
     """
     chosen = _by_suffix(path, None, "write")
     detected = _BLOCK_WRITERS[chosen.suffix](path, ions)
@@ -433,11 +416,6 @@ def _warn_of_lost(path, chosen, lost):
 
 def left_out(path: AnyPath, hits: Hits, *, format: str | None = None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Columns that a file of this format does not contain, and missing ones that it contains as zeros.
-
-    Parameters
-    ----------
-    path, hits, format
-        As for `write`.
 
     Returns
     -------
@@ -505,22 +483,7 @@ def _ranges_of(path, read):
 
 
 def format_of(path: AnyPath, format: str | None = None) -> Format:
-    """Format of a file, by its first bytes if possible, otherwise by its suffix.
-
-    Parameters
-    ----------
-    path, format
-        As for `read`.
-
-    Returns
-    -------
-    Format
-
-    Raises
-    ------
-    FileError
-        If the file is missing or unreadable, or its format is unknown or can only be written.
-    """
+    """Format of a file, by its first bytes if possible, otherwise by its suffix."""
     head = read_head(path, 64)
     chosen = _by_content(head) if format is None else None
     if chosen is None:

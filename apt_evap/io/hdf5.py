@@ -13,24 +13,7 @@ from apt_evap.io.pyccapt import is_pyccapt, read_pyccapt
 
 
 def read_hdf5(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
-    """Read the ions of an HDF5 file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; all by default.
-
-    Returns
-    -------
-    Hits
-
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged, or of another kind.
-    """
+    """Read the ions of an HDF5 file."""
     name = str(check_path(path))
     with open_hdf5(path) as file:
         kind = file.label.kind if file.label else ""

@@ -58,24 +58,11 @@ def read_dump(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         Units of LAMMPS: metal, real (Angstrom), electron, nano, micro, cgs or si. A file that states its units is read
         in these.
     frame : int
         Number of the frame, from 0; negative numbers count from the end.
-
-    Returns
-    -------
-    Atoms
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or not such a file, or has no such frame.
-    ValueError
-        If `frame` is not an integer.
     """
     where = f"{str(path)!r}"
     lines = read_text(path, "the text of a LAMMPS dump", _MAX_BYTES).splitlines()
@@ -185,22 +172,11 @@ def read_data(path: AnyPath, *, units: str = "metal", style: str | None = None) 
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         As for `read_dump`.
     style : str, optional
         Style of the section Atoms, such as atomic, charge, sphere, molecular or full. By default the one in the comment
         of this line, or atomic if the number of columns fits.
-
-    Returns
-    -------
-    Atoms
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or not such a file, or the style is unknown.
     """
     where = f"{str(path)!r}"
     lines = read_text(path, "the text of a LAMMPS data file", _MAX_BYTES).splitlines()

@@ -15,9 +15,9 @@ from apt_evap._common.kept import digest_of
 from apt_evap._common.validation import check_array, check_kind, check_number, check_sequence, did_you_mean, short_text
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.io import formats
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.io.ion_blocks import IonBlocks
 from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
 
 _ARRAYS = ("values", "x_edges", "y_edges", "mask")
@@ -109,15 +109,7 @@ class MeasuredFile:
         return replace(self, peaks=None, distance=None)
 
     def load(self, read: Callable[..., Any] = formats.read) -> Any:
-        """The content of the file, without the distortion, by a function such as `apt_evap.read`.
-
-        Raises
-        ------
-        FileError
-            If a file cannot be read.
-        ValueError
-            If an option is not for this file.
-        """
+        """The content of the file, without the distortion, by a function such as `apt_evap.read`."""
         for name in _OF_IONS if self.is_map else ("arrays",):
             if getattr(self, name) is not None:
                 what = "ions" if self.is_map else "a map in an .npz file"
@@ -149,11 +141,6 @@ class MeasuredFile:
             Receives the number of ions of each block, and of the file.
         further : tuple of str
             Columns that are read if the file has them.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be read.
         """
         changed = (self.selects, self.peaks, self.undistort, self.exchange_axes, self.distance)
         if any(change not in (None, False) for change in changed) or self.is_map or not os.path.isfile(self.path):
@@ -161,15 +148,7 @@ class MeasuredFile:
         return formats.ion_blocks(self.path, columns, further=further, progress=progress, **self._reading())
 
     def measured(self, note: Callable[[str], None], read: Callable[..., Any] = formats.read) -> Hits | DetectorMap:
-        """The ions that are used, for a map, or the map of the file; notes say which ions are those of `peaks`.
-
-        Raises
-        ------
-        FileError
-            If a file cannot be read.
-        ValueError
-            If it contains something else, or the ions make no map.
-        """
+        """The ions that are used, for a map, or the map of the file; notes say which ions are those of `peaks`."""
         content = self.load(read)
         if isinstance(content, DetectorMap):
             return content
@@ -206,15 +185,6 @@ class MeasuredFile:
         note : callable, optional
             Receives which ions are those of `peaks`. If there are no such peaks, all ions are used, which it receives,
             too; without it, this is an error.
-
-        Returns
-        -------
-        Hits
-
-        Raises
-        ------
-        ValueError
-            If a column is missing, or no ion remains.
         """
         if self.species is None and self.ranges is not None:
             raise ValueError(f"--species is missing: names of species in {self.ranges!r}")
@@ -355,10 +325,6 @@ class MeasuredFile:
             Columns of the ions of the file, from which masses may follow; empty for a map.
         start : str
             Expression of all ions of the file, by default that of reading it.
-
-        Returns
-        -------
-        str
         """
         ae = _Code("ae")
         code = _Code(start) if start else ae.read(self.path, **self._reading())

@@ -52,22 +52,11 @@ def write_nxapm(path: AnyPath, hits: Hits, *, elements: Sequence[str], start_tim
 
     Parameters
     ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions.
     elements : sequence of str
         Chemical symbols of the elements in the specimen, which NXapm requires, such as ``("Si", "O")``.
     start_time : str, optional
         Start of the measurement in ISO 8601 with the offset from UTC, such as "2026-05-04T09:30:00+02:00", which NXapm
         requires. By default the time of writing.
-
-    Raises
-    ------
-    ValueError
-        If an element is not a chemical symbol, or the time has another format.
-    FileError
-        If the file cannot be written.
     """
     elements = check_sequence(elements, "elements", "chemical symbols, such as ('Si', 'O')")
     for element in elements or (None,):
@@ -121,24 +110,7 @@ def _time(text):
 
 
 def read_nxapm(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits:
-    """Read the ions of an NXapm file that was written by `write_nxapm`.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default.
-
-    Returns
-    -------
-    Hits
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, damaged or not such a file, or has no such column.
-    """
+    """Read the ions of an NXapm file that was written by `write_nxapm`."""
     with open_hdf5(path, "NXapm") as file:
         if file.label is None or file.label.kind != KIND:
             raise FileError(f"{file.name!r} is not an NXapm file of this package: it has no group {_OWN!r}")

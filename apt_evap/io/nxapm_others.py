@@ -91,23 +91,11 @@ def read_nxapm_of_others(path: AnyPath, *, columns: Sequence[str] | None = None)
     A column of zeros is treated as absent, as in an .epos: positions, masses, times, standing voltages and hits. A
     column whose unit is missing or unknown is an error.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default.
-
     Returns
     -------
     Hits
         x, y [mm], time_of_flight [ns], voltage, pulse_voltage [V], mass_to_charge [Da], positions [nm], pulses,
         pulse_id, multiplicity and ion, as far as the file has them.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, damaged or has no such columns, or a unit is missing or unknown.
     """
     with open_hdf5(path, "NXapm") as file:
         entry = _entry(file)

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from apt_evap._common.files import replace_file
 from apt_evap._common.types import AnyPath
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.io._records import BlockWriter, check_columns, choose, open_words, tell_omitted, write_words
-from apt_evap.io.ion_blocks import IonBlocks
 
 _ROW = 16
 _FIELDS = {"positions": (0, 3, "f4"), "mass_to_charge": (3, 1, "f4")}
@@ -21,28 +21,10 @@ def read_pos(
 ) -> Hits:
     """Read a .pos file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read, "positions" and "mass_to_charge"; all by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads big-endian and checks the byte order.
-
     Returns
     -------
     Hits
         With positions [nm] and mass_to_charge [Da].
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
-    TruncatedFile
-        If the size is not a multiple of 16 bytes and `partial` is False.
     """
     fields = _chosen(columns, path)
     with _open(path, partial, byte_order) as words:
@@ -103,33 +85,13 @@ def write_pos(path: AnyPath, hits: Hits) -> None:
 
     Ions that did not hit the detector and ions whose position or mass is not finite are left out, and a warning gives
     their number.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        Ions with positions; if there is no mass_to_charge, zeros are written.
-
-    Raises
-    ------
-    ValueError
-        If there are no positions, or no ion to write.
-    FileError
-        If the file cannot be written.
     """
     columns, _ = _written(hits)
     write_words(path, columns, _ROW, choose(path, hits, columns))
 
 
 def write_pos_blocks(path: AnyPath, ions: IonBlocks) -> int:
-    """Write the detected ions of a large file as `write_pos` does, block by block; return the number of detected ions.
-
-    Raises
-    ------
-    ValueError, FileError
-        As for `write_pos`.
-    """
+    """Write the detected ions of a large file as `write_pos` does, block by block; return their number."""
     with replace_file(path) as file:
         writer = ions.fed(lambda: BlockWriter(file, _ROW, _written))
         tell_omitted(path, writer.detected, 0, writer.detected - writer.written)

@@ -86,24 +86,12 @@ def read_pyccapt(path: AnyPath, *, columns: Sequence[str] | None = None) -> Hits
     of the detector, and an error: their scale depends on the version of PyCCAPT. In files of early versions the column
     ``pulse`` is the pulse voltage or the power of the laser, read as a voltage.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to return. All by default.
-
     Returns
     -------
     Hits
         With x, y [mm], time_of_flight [ns], voltage, pulse_voltage [V], pulse_id and multiplicity; after a calibration
         also mass_to_charge [Da], positions [nm] and pulses. ``extra`` contains "start_counter", "laser_pulse" [pJ],
         "calibrated_time_of_flight" [ns], "uncalibrated_mass_to_charge" [Da] and, if it is not used, "multi".
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or not such a file, or has no such column.
     """
     with open_hdf5(path, "a file of PyCCAPT") as file:
         if "dld" in file:
@@ -209,20 +197,6 @@ def write_pyccapt(path: AnyPath, hits: Hits) -> None:
 
     All floats are float64, as in PyCCAPT, and all counts int64. Missing columns are zeros. The start counter is that in
     ``extra``, or else the number of the pulse; "multi" is the number of ions of a pulse for each of its ions.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete, but never a run.
-    hits : Hits
-        The ions.
-
-    Raises
-    ------
-    ValueError
-        If there are no detector coordinates, or there is no ion to write.
-    FileError
-        If the file is a run, or cannot be written.
     """
     place = check_path(path)
     if place.is_file() and (label := _label(place)) is not None and label.kind.split()[0] == "run":

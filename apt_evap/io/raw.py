@@ -42,31 +42,11 @@ def read_raw(
     Consecutive ions with the same pulse number belong to one pulse; the number may wrap around. If it is zero for all
     ions, they are not grouped.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    columns : sequence of str, optional
-        Names of the columns to read; only these are kept in memory. All by default.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads little-endian and checks the byte order.
-    detector_unit : {"mm", "cm", "m", "um"}
-        Unit of the detector coordinates in the file.
-
     Returns
     -------
     Hits
         With voltage, pulse_voltage [V], x, y [mm], time_of_flight [ns], pulse_id and multiplicity;
         ``extra`` contains "reflectron_voltage" [V], "epoch" and "pulse_number".
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty or in the wrong byte order, or has no such column.
-    TruncatedFile
-        If the size is not a multiple of 32 bytes and `partial` is False.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     with _open(path, partial, byte_order) as words:
@@ -89,11 +69,6 @@ def chunk_raw(
     Yields
     ------
     Hits
-
-    Raises
-    ------
-    ValueError
-        If `rows` is less than the number of ions of one pulse.
     """
     chosen, fields = choose_fields(columns, _COLUMNS, _FIELDS, path, _WITH)
     fields = {**fields, "pulse_number": _FIELDS["pulse_number"]}

@@ -27,22 +27,12 @@ from apt_evap.warnings import DataWarning, warn
 def read_rng(path: AnyPath) -> Ranges:
     """Read the mass ranges of an .rng file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     Ranges
         In the order of the file. A range has the name and colour of the polyatomic extension if this contains the same
         bounds. Otherwise its name is its formula, such as "CrO2", and a range of one species has its colour. Ranges
         without any species are left out, with a warning.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or unreadable, has no ranges, or its list of species cannot be read.
 
     Warns
     -----

@@ -29,22 +29,12 @@ from apt_evap.warnings import DataWarning, warn
 def read_rrng(path: AnyPath) -> Ranges:
     """Read the mass ranges of an .rrng file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     Ranges
         In the order of the file. The name of a range is its ``Name`` or, if missing, its atoms, such as "CrO2".
         Molecules such as ``SiO2:1`` count with their atoms, and isotopes such as ``Ni58:1`` as one: the mass decides
         between them. A volume of 0 is unknown.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or unreadable, or has no range.
 
     Warns
     -----

@@ -63,13 +63,6 @@ WRITTEN = ("x", "y", "time_of_flight", "voltage", "positions", "ion", "site", *_
 def read_tapsim(path: AnyPath, *, partial: bool = False) -> Hits:
     """Read a result table of TAPSim.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file, text or binary.
-    partial : bool
-        Read the complete rows of a file that ends in the middle of a row.
-
     Returns
     -------
     Hits
@@ -77,13 +70,6 @@ def read_tapsim(path: AnyPath, *, partial: bool = False) -> Hits:
         ended, NaN if unknown), ion (index of the event) and site (number of the node). ``extra`` contains "id" of the
         type of atom, "stop_z" [mm], "probability", "potential_before" and "potential_after" [V], "field_before" and
         "field_after" [V/nm], "normal" and "apex" [nm]; the vectors have shape (n, 3).
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable, empty or not such a table.
-    TruncatedFile
-        If it ends in the middle of a row and `partial` is False.
     """
     check_switch(partial, "partial")
     data = read_bytes(path, "a result table of TAPSim", _MAX_BYTES)
@@ -177,20 +163,6 @@ def write_tapsim(path: AnyPath, hits: Hits, *, binary: bool = False) -> None:
     The columns are those of `read_tapsim`. A number that the ions do not have is "nan", the index their row, the id and
     the number of the node 0. The ions of a run have neither the potentials nor the direction of the field. Text has
     nine digits, TAPSim itself writes seven; binary numbers are float32.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        The ions. Those that missed the detector are written, too.
-    binary : bool
-        Write binary rows instead of text.
-
-    Raises
-    ------
-    FileError
-        If the file cannot be written.
     """
     check_switch(binary, "binary")
     n = len(hits)

@@ -36,22 +36,10 @@ def is_nodes(path: AnyPath) -> bool:
 def read_nodes(path: AnyPath) -> Atoms:
     """Read the atoms of a node file of TAPSim.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     Atoms
         Without the nodes of the vacuum and the boundaries (ids 0 to 3); the name of a type is its id.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or not such a file, or has no atoms.
-    TruncatedFile
-        If it ends before its last node.
     """
     data = read_bytes(path, "a node file of TAPSim", _MAX_BYTES)
     match = _HEADER.match(data[: 1 << 12])

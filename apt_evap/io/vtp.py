@@ -18,20 +18,6 @@ def write_vtp(path: AnyPath, hits: Hits) -> None:
     ions, is an array of strings, with an array of its numbers in alphabetical order (element_number), because ParaView
     colours by numbers only. Ions whose positions are not finite are left out. Ions that missed the detector are
     written, with NaN for missing values.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        Ions with positions.
-
-    Raises
-    ------
-    ValueError
-        If there are no positions, or none is finite.
-    FileError
-        If the file cannot be written.
     """
     _, positions, data = points_and_data(path, hits)
     for name, texts in [(name, values) for name, values in data.items() if values.dtype.kind == "U"]:

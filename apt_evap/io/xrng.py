@@ -35,23 +35,7 @@ class _Node:
 
 
 def read_xrng(path: AnyPath) -> Ranges:
-    """Read the mass ranges of an .xrng file.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
-    Returns
-    -------
-    Ranges
-        In the order of the file. The name of a range is the formula of its ion, such as "MgO"; a range with several
-        ions has the first one.
-
-    Raises
-    ------
-    FileError
-        If the file is missing or unreadable, is not such XML, or has no range.
+    """Read the mass ranges of an .xrng file; a range with several ions has the formula of the first one.
 
     Warns
     -----

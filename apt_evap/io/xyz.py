@@ -21,23 +21,6 @@ def write_xyz(path: AnyPath, hits: Hits, *, species: str | Sequence[str] | None 
     are declared as real numbers, because ASE does not support them. Texts, such as the phases of simulated ions, are
     words with _ for spaces. Ions whose positions are not finite are left out. Ions that missed the detector are
     written.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    hits : Hits
-        Ions with positions.
-    species : str or sequence of str, optional
-        Species of all ions, or of each ion, such as ``ranges.labels(hits)``; by default the column "element" of
-        ``hits.extra``, which simulated ions have, otherwise X. ASE accepts only chemical elements and X.
-
-    Raises
-    ------
-    ValueError
-        If there are no positions, none is finite, or a species is not one word.
-    FileError
-        If the file cannot be written.
     """
     chosen, positions, data = points_and_data(path, hits)
     if species is None:  # a name of the user may have several words

@@ -29,23 +29,10 @@ def read_xyz(path: AnyPath, *, units: str = "metal", frame: int = -1) -> Atoms:
 
     Parameters
     ----------
-    path : str or path-like
-        The file.
     units : str
         Units of LAMMPS, if it has written the file in others than Angstrom.
     frame : int
         Number of the frame, from 0; negative numbers count from the end.
-
-    Returns
-    -------
-    Atoms
-
-    Raises
-    ------
-    FileError
-        If the file is missing, unreadable or not such a file, or has no such frame.
-    ValueError
-        If `frame` is not an integer.
     """
     where = f"{str(path)!r}"
     lines = read_text(path, "the text of an .xyz file", _MAX_BYTES).splitlines()

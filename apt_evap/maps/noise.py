@@ -54,16 +54,7 @@ def effective_ions(map: DetectorMap) -> float:
 
 
 def hits_per_bin(map: DetectorMap, ions: float | None) -> tuple[Floats, bool]:
-    """Hits per bin inside the mask, shape (n,), and whether their noise is known.
-
-    Parameters
-    ----------
-    map : DetectorMap
-        Counts or densities.
-    ions : float, optional
-        Number of hits inside the mask whose counting noise the map has; by default its counts, or `effective_ions`.
-        Infinite for a map without noise.
-    """
+    """Hits per bin inside the mask, shape (n,), and whether their noise is known."""
     values = np.asarray(map.values[map.mask], float)
     if ions is None:
         if map.is_counts:

@@ -67,10 +67,6 @@ def pole_frame(map: DetectorMap, projection: Directions, pole: ArrayLike, ions: 
         Direction of the pole in the frame of the projection, shape (3,).
     ions : float or None
         As for `hits_per_bin`.
-
-    Returns
-    -------
-    PoleFrame
     """
     check_kind(map, "map", DetectorMap, "a DetectorMap")
     check_kind(projection, "projection", "directions", "a Projection")

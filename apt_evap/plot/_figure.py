@@ -125,15 +125,7 @@ def raised_charge(charge: int) -> str:
 
 
 def set_log_ticks(axis: Axis, least_range: float = 1.0) -> None:
-    """Set the ticks of a logarithmic axis to round numbers, at least three.
-
-    Parameters
-    ----------
-    axis : matplotlib.axis.Axis
-        A logarithmic axis with its data.
-    least_range : float
-        Widen the axis to a range of at least this factor.
-    """
+    """Set the ticks of a logarithmic axis to round numbers, at least three."""
     low, high = axis.get_view_interval()
     wider = np.sqrt(least_range * low / high)
     if wider > 1:

@@ -14,7 +14,7 @@ from apt_evap.detection.binning import bins_for, shown_bins
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.io.ion_blocks import IonBlocks
+from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.maps.crystallography.directions import label as plane_label
 from apt_evap.plot._figure import (
     OUTSIDE,
@@ -158,16 +158,6 @@ def detector_maps(
 
 def specimen_title(run: Run) -> str:
     """Title of maps of a run: the crystal, its direction along the axis, and the radius.
-
-    Parameters
-    ----------
-    run : Run
-        The run.
-
-    Returns
-    -------
-    str
-        Its axis is written in the math syntax of matplotlib.
 
     Examples
     --------

@@ -20,13 +20,7 @@ MECHANISMS = ("lateral velocity", "roll-up")
 
 
 def ion_colors(n: int) -> list[str]:
-    """Colours of selected ions, the same in every plot.
-
-    Parameters
-    ----------
-    n : int
-        Number of ions.
-    """
+    """Colours of selected ions, the same in every plot."""
     return [f"C{index % 10}" for index in range(n)]
 
 

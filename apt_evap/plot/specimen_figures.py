@@ -247,7 +247,6 @@ def mark_atoms(
     colors: Any = "black",
     elevation: float = 90.0,
     azimuth: float = -90.0,
-    size: float = 14.0,
 ) -> DrawnAxes:
     """Draw dashed circles around atoms in a plot of the specimen.
 
@@ -261,16 +260,14 @@ def mark_atoms(
         Colours of the circles.
     elevation, azimuth : float
         As for the plot [degrees].
-    size : float
-        Diameter of the circles [points].
     """
     positions = check_array(positions, "positions", ("n", 3))
     right, up, _ = _viewed_from(elevation, azimuth)
     ax.scatter(
-        positions @ right, positions @ up, s=size**2, facecolors="none", edgecolors="white", linewidths=3.2, zorder=3
+        positions @ right, positions @ up, s=14.0**2, facecolors="none", edgecolors="white", linewidths=3.2, zorder=3
     )
     ax.scatter(
-        positions @ right, positions @ up, s=size**2, facecolors="none", edgecolors=colors, linewidths=1.8,
+        positions @ right, positions @ up, s=14.0**2, facecolors="none", edgecolors=colors, linewidths=1.8,
         linestyles=(0, (2.5, 1)), zorder=4,
     )  # fmt: skip
     return ax

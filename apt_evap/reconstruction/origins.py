@@ -23,10 +23,10 @@ from apt_evap._common.validation import (
 )
 from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
-from apt_evap.maps.crystallography.symmetry import symmetry_about_axis
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import rotation_to_axis
 from apt_evap.specimen.materials import Material
+from apt_evap.specimen.symmetry import symmetry_about_axis
 
 NEIGHBOURS = 16
 """Ions of a mean. Measured with 4 runs of 8,000 ions of Ni[111], R = 14 a: 10, 25 and 50 of three runs leave 0.229,

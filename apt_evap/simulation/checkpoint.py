@@ -17,9 +17,9 @@ import numpy as np
 from apt_evap._common.codec import check_itself
 from apt_evap._common.files import FileError, check_path, check_regular, remove_abandoned
 from apt_evap._common.interrupts import uninterrupted
-from apt_evap._common.locks import FileLock
 from apt_evap._common.validation import check_count, check_number, check_switch
 from apt_evap.emission.perturbations import described
+from apt_evap.simulation.locks import FileLock
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import count_ions, is_run
 from apt_evap.simulation.stop_reason import StopReason

@@ -44,15 +44,6 @@ class Monitor:
 def charge_residuals(emitter: Emitter, sample: int, seed: int) -> Floats:
     """Residuals of the equation of the charging rule for sampled charges, by direct sums.
 
-    Parameters
-    ----------
-    emitter : Emitter
-        The charged surface.
-    sample : int
-        Number of evaporable surface atoms in the random sample; all of them if there are fewer.
-    seed : int
-        Seed of the sample.
-
     Returns
     -------
     ndarray, shape (sample,)

@@ -190,11 +190,6 @@ def real_voltages(
         The operating field over the evaporation field.
     field_ratio : float or None
         Field at the evaporating atoms divided by the mean field of the cap; None without a history of the cap.
-
-    Raises
-    ------
-    ValueError
-        If the fields of the cap are not known.
     """
     known = np.isfinite(cap.ratios)
     cap_ratios = np.full(len(ions), np.nan)
@@ -226,11 +221,6 @@ def check_flight_charges(flight_charges: Any, names: tuple[str, ...]) -> dict[st
         from the local field.
     names : tuple of str
         Elements of the species.
-
-    Raises
-    ------
-    ValueError
-        If an element or a charge is unknown.
     """
     if isinstance(flight_charges, PostIonisation):
         return flight_charges
@@ -316,20 +306,7 @@ def isotopes_of(names: tuple[str, ...], species: Integers, masses: Floats, u: Fl
 
 
 def real_units_of(run: Any, point: OperatingPoint) -> tuple[RealUnits, RealColumns]:
-    """Operating point and columns of a run in real units, see `Run.at_evaporation_field`.
-
-    Parameters
-    ----------
-    run : Run
-        The run at its simulated voltage.
-    point : OperatingPoint
-        Operating field, charges in flight, pulses and errors of the times.
-
-    Returns
-    -------
-    RealUnits
-    RealColumns
-    """
+    """Operating point and columns of a run in real units, see `Run.at_evaporation_field`."""
     tip, emissions, evaporation_fields = run.settings["tip"], run.emissions, run.evaporation_fields
     control = point.control
     if control is None:

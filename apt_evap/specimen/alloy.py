@@ -59,20 +59,7 @@ class Segregation:
 
 
 def by_material(values: Any, name: str) -> dict[Material, Any]:
-    """Return the values of elements by Material, dict.
-
-    Parameters
-    ----------
-    values : mapping or list
-        Values by element (Material, its name, or a table of a file), or pairs of these, as a run contains them.
-    name : str
-        Name of the argument, for the message.
-
-    Raises
-    ------
-    ValueError
-        If it is something else, an element is unknown, or an element occurs twice.
-    """
+    """Return the values of elements by Material, dict."""
     materials: dict[Material, Any] = {}
     for element, value in check_pairs(values, name, "a table of an element to its atomic fraction"):
         material = as_material(element, name)
@@ -93,11 +80,6 @@ def check_solutes(
         Atomic fraction, or `Segregation`, by element (str or Material).
     profiles : bool
         Whether a `Segregation` is possible.
-
-    Raises
-    ------
-    ValueError
-        If a fraction is not positive, or if they sum to more than 1.
     """
     fractions: dict[Material, Any] = {}
     if solutes is not None:

@@ -39,11 +39,6 @@ def draw_isotopes(names: Sequence[str], species: ArrayLike, masses: ArrayLike, u
     -------
     ndarray
         Mass of each ion [Da], shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, a mass is not positive, or a species or a random number is outside its range.
     """
     names = check_sequence(names, "names", "element names")
     masses = check_array(masses, "masses", (len(names),))

@@ -137,11 +137,6 @@ def check_axis(structure: str, axis: Sequence[float]) -> tuple[int | float, ...]
     -------
     tuple
         Ints without a common factor if all numbers are integers, otherwise the floats unchanged.
-
-    Raises
-    ------
-    ValueError
-        If it is not a direction.
     """
     four = structure == "hcp" and np.shape(axis) == (4,)
     try:

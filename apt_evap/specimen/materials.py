@@ -6,9 +6,8 @@ from typing import Any
 
 from apt_evap._common.codec import checked, choice, count, from_plain, number, settings
 from apt_evap._common.notebook import as_table
-from apt_evap._common.validation import check_kind, check_name, check_number, did_you_mean, short_text
+from apt_evap._common.validation import check_kind, check_name, did_you_mean, short_text
 from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
-from apt_evap.units import ELEMENTARY_CHARGE
 
 _KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 1, table 3"
 _COHESION = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 3, table 1"
@@ -236,21 +235,7 @@ def material(name: str, **changes: Any) -> Material:
 
 
 def as_material(value: Material | str | Mapping[str, Any], name: str = "material") -> Material:
-    """Return a Material, looked up if `value` is a name.
-
-    Parameters
-    ----------
-    value : Material or str or mapping
-        Material, the name of a known one, or a table of a file: the name of a known one and the numbers that are
-        changed, or all fields.
-    name : str
-        Name of the argument, for the message.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, or if no material has this name.
-    """
+    """Return a Material, looked up if `value` is a name."""
     if isinstance(value, str):
         return material(value)
     if isinstance(value, Mapping):
@@ -258,43 +243,3 @@ def as_material(value: Material | str | Mapping[str, Any], name: str = "material
             return material(**value)
         return from_plain(value, Material, what=name)
     return check_kind(value, name, Material, "a Material or its name")
-
-
-def polarization_energy(
-    polarizability: float, voltage: float, field_factor: float, radius: float, step: float
-) -> float:
-    """Energy gain by polarization of an atom that moves one step up the field gradient: a lower bound of E_perp.
-
-    Parameters
-    ----------
-    polarizability : float
-        Polarizability alpha [F m^2].
-    voltage : float
-        Applied voltage V [V].
-    field_factor : float
-        Geometry factor k of F = V/(k r).
-    radius : float
-        Radius of the apex r [nm].
-    step : float
-        Length of the step [nm].
-
-    Returns
-    -------
-    float
-        Energy [eV].
-
-    Raises
-    ------
-    ValueError
-        If a number is outside its range.
-
-    Notes
-    -----
-    E = alpha V^2 / k^2 step / r^3 (Shaikh et al., arXiv 2509.13744, appendix on polarization).
-    """
-    alpha = check_number(polarizability, "polarizability", above=0, unit="F m^2")
-    voltage = check_number(voltage, "voltage", unit="V")
-    factor = check_number(field_factor, "field_factor", at_least=0.1, at_most=100)
-    radius = check_number(radius, "radius", above=0, unit="nm")
-    step = check_number(step, "step", at_least=0, unit="nm")
-    return alpha * (voltage / factor) ** 2 * step / radius**3 * 1e18 / ELEMENTARY_CHARGE

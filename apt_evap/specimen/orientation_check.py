@@ -94,11 +94,6 @@ def check_spacing(distance: float, expected: Sequence[float], names: Sequence[st
     n : int
         Number of atoms; below 50, nothing is checked.
 
-    Raises
-    ------
-    ValueError
-        If the distance would fit in another unit, which is named.
-
     Warns
     -----
     SpecimenWarning

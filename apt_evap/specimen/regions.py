@@ -282,13 +282,7 @@ def contains(region: Any, points: Floats) -> Booleans:
 
 
 def boundary_distance(region: Any, points: Floats) -> Floats:
-    """Distance of points (n, 3) from the boundary of a region [nm], negative inside, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If the region is a function, which has no distance.
-    """
+    """Distance of points (n, 3) from the boundary of a region [nm], negative inside, shape (n,)."""
     if not callable(getattr(region, "distance", None)):
         raise ValueError(
             f"a profile about the boundary needs a region with a method distance, got the function {short_text(region)}"

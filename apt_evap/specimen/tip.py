@@ -612,19 +612,7 @@ def estimated_atoms(
     depth: float | None = None,
     **others: Any,
 ) -> tuple[float, float]:
-    """Estimate the numbers of atoms in memory and of surface atoms of a `Tip`, without building it.
-
-    Parameters
-    ----------
-    apex_radius, material, phases, shank_angle, shank_length, base, depth
-        As for `Tip`; of several phases, the first.
-    **others
-        The other parameters of `Tip`, which do not change the numbers.
-
-    Returns
-    -------
-    atoms, surface_atoms : float
-    """
+    """Estimate the numbers of atoms in memory and of surface atoms of a `Tip`, without building it."""
     host = as_material(material) if phases is None else phases[0].material  # type: ignore[arg-type]
     shape = TaperedCap(apex_radius, 2 * apex_radius if shank_length is None else shank_length, shank_angle, base)
     criterion = SurfaceCriterion.of(host.structure, host.nearest_neighbour_distance)

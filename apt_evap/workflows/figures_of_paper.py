@@ -24,8 +24,6 @@ from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.evaporation.emitter import Emitter
-from apt_evap.evaporation.law import Extremal
 from apt_evap.fit.fit_energies import fit_energies
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
@@ -152,8 +150,9 @@ class _ChosenFirst:
     atoms: Integers
 
     def keys(self, tip: Tip, atoms: Integers, fields: Floats, bonds: Integers) -> Floats:
-        """Keys of `Extremal`, multiplied by a million for the chosen atoms."""
-        return Extremal().keys(tip, atoms, fields, bonds) * np.where(np.isin(atoms, self.atoms), 1e6, 1.0)
+        """Ratios of field to evaporation field, multiplied by a million for the chosen atoms."""
+        ratios = fields / tip.evaporation_fields[tip.species[atoms]]
+        return np.where(tip.evaporable[atoms], ratios, 0.0) * np.where(np.isin(atoms, self.atoms), 1e6, 1.0)
 
 
 def _chosen(emitter):
@@ -172,7 +171,7 @@ def _response(case, radius, threads):
     """Emitter before the run, run in which only the chosen atoms evaporate, its ions in order of choice."""
     metal = as_material(case.element)
     tip = Tip(metal, radius * metal.a, case.axis, shank_length=radius * metal.a, depth=8 * metal.a)
-    emitter = Emitter(tip)
+    emitter = Simulation(tip, n_threads=threads).emitter
     atoms = _chosen(emitter)
     simulation = Simulation(tip, seed=1, law=_ChosenFirst(atoms), n_threads=threads)
     run = simulation.run(len(atoms), progress=False).unless_interrupted()

@@ -25,16 +25,6 @@ class KeptFiles:
     The digest of a file is recorded before the file is written. So a file is missing, or as recorded, or of another
     program.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder; it is made with the first file.
-    made_from : mapping
-        What the files are made from, in the types of JSON: SHA-256 of the input files, and values of all options that
-        change a result, by name.
-    names : sequence of str
-        Names that files and folders of the command may have.
-
     Raises
     ------
     FileError

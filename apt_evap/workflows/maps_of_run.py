@@ -5,11 +5,11 @@ from dataclasses import replace
 from typing import Any
 
 from apt_evap._common.codec import from_plain
-from apt_evap.config.map_panels import MapSettings, Panel
 from apt_evap.detection.binning import shown_bins
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.simulation.config.map_panels import MapSettings, Panel
 from apt_evap.simulation.run import Run
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from apt_evap._common.files import replace_file
-from apt_evap.config.cost_estimate import estimate_cost
-from apt_evap.config.simulation_file import read_config
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp
+from apt_evap.simulation.config.cost_estimate import estimate_cost
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.workflows.advice import advice_as_notes
@@ -167,21 +167,7 @@ _NEEDED = {  # runs of each figure; figure 2 has its own specimens, of a few eve
 
 
 class PaperRuns:
-    """The runs of some figures, in a folder.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the figures.
-    size : PaperSize
-        Size of the simulations.
-    threads : int, optional
-        Number of threads; by default the number of processors that this process may use.
-    progress : callable
-        Returns the progress of a run, as for `simulate`.
-    note : callable
-        Receives lines of text on what is done.
-    """
+    """The runs of some figures, in a folder."""
 
     def __init__(
         self,

@@ -16,8 +16,6 @@ from apt_evap._common.notebook import as_table
 from apt_evap._common.threads import thread_count
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
-from apt_evap.config.material_text import write_material
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
@@ -40,6 +38,8 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Candidate, Indexing, index
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.config.material_text import write_material
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.stop_reason import StopReason
@@ -71,11 +71,6 @@ class Twin:
 
     What an earlier call has left in the folder is read. The indexing, the study and the measurement are not in it as
     objects: they are computed again when they are first asked for, with the same result.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the files.
     """
 
     def __init__(

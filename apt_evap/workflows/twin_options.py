@@ -7,9 +7,9 @@ from apt_evap._common.codec import to_plain
 from apt_evap._common.files import sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_number
-from apt_evap.config.lens_text import read_lens
-from apt_evap.config.material_text import write_material
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
+from apt_evap.simulation.config.lens_text import read_lens
+from apt_evap.simulation.config.material_text import write_material
 from apt_evap.specimen.materials import Material, as_material
 
 

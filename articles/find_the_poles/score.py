@@ -14,7 +14,7 @@ import time
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.specimen.symmetry import point_group
 
 NEAR = 2.0  # degrees
 PLACES = np.array([[0.0, 0.0], [15.0, 0.0], [-10.0, 12.0]])  # mm

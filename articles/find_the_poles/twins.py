@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.orientation_search import disc_of
+from apt_evap.specimen.symmetry import point_group
 
 TIPS = {  # radius [a], charging rule, events before the first ion, ions, seed of axis and offset
     "Pt": (24, "constant", 4_000, 14_000, 61),

@@ -34,23 +34,21 @@ from apt_evap._common.validation import (
     check_values,
     short_text,
 )
-from apt_evap.analysis.apex import field_factor
 from apt_evap.analysis.ion_image import tunnel_factor
 from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
-from apt_evap.config.cost_estimate import CostEstimate
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
 from apt_evap.emission.surface_frame import tangent_frame, target_shares
 from apt_evap.maps.crystallography.directions import direction_normals, plane_normals
-from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
 from apt_evap.maps.noise import effective_ions
 from apt_evap.maps.registration.polynomial import Distortion
+from apt_evap.simulation.config.cost_estimate import CostEstimate
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.real_units import RealUnits
 from apt_evap.specimen.lattice import nearest_neighbour_distance
-from apt_evap.specimen.materials import polarization_energy
 from apt_evap.specimen.shape import TaperedCap
+from apt_evap.specimen.symmetry import point_group, pole_symmetry, symmetry_about_axis
 
 NAN, INF = math.nan, math.inf
 NEITHER = [None, "x", "5", True, 1j, [1.0], {}, b"x", object(), np.array([1.0, 2.0])]  # no number
@@ -448,11 +446,6 @@ CASES = [
     row(ranges.index),
     row(ranges.labels, {"hits": hits}),
     row(
-        polarization_energy,
-        {"polarizability": 1e-40, "voltage": 1e3, "field_factor": 3.0, "radius": 10.0, "step": 0.3},
-        "polarizability field_factor radius",
-    ),
-    row(
         ae.reconstruct,
         {"hits": hits, "atomic_volume": 0.011, "distance": 100.0, "evaporation_field": 35.0},
         "atomic_volume distance evaporation_field field_factor compression efficiency radius detector_radius area",
@@ -657,7 +650,6 @@ NEEDS_A_RUN = [
     row(ae.analysis.field_ion_image),
     row(target_shares, {"sharpness": 0.1}),
     row(ae.analysis.image_compression),
-    row(field_factor),
     row(evaporation_fields),
     row(evaporation_voltages),
     row(ae.reconstruction.run_constants),

@@ -15,9 +15,9 @@ from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
 from apt_evap.cli._files import read_registration
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import COMMANDS, make_parser
-from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.background_run import BackgroundRun
 from apt_evap.fit.start_settings import is_start
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.studies.sweep.planning import plan_sweep
 from apt_evap.workflows.kept_files import KeptFiles

@@ -122,7 +122,7 @@ def test_run_foretells_its_time_and_says_what_it_does_before_the_first_ion(folde
         told_before.append(capsys.readouterr().out)
         raise ValueError("stopped here")
 
-    monkeypatch.setattr("apt_evap.config.simulation_file.Config.simulation", simulation)
+    monkeypatch.setattr("apt_evap.simulation.config.simulation_file.Config.simulation", simulation)
     assert main(["run", "small.toml", "--ions", "50"]) == 2
     (told,) = told_before
     assert "50 ions of " in told and " GB, " in told and " min" in told and "surface" in told

@@ -6,7 +6,7 @@ import pytest
 import apt_evap as ae
 from apt_evap import plot
 from apt_evap.cli.main import main
-from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.specimen.symmetry import point_group
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
+from rough import ROUGH
 
 import apt_evap as ae
 from apt_evap.cli import reconstruct
@@ -119,7 +120,7 @@ def test_ions_without_voltages(measured, capsys):
 def radius5(made_once, tmp_path_factory):
     """A run of 1,200 ions of a tip with a radius of 5 nm, and its file."""
     tip = ae.Tip("Ni", apex_radius=5.0, axis=(1, 1, 1), shank_length=5.0, depth=1.5)
-    run = made_once(tip, 1200, seed=1)
+    run = made_once(tip, 1200, seed=1, **ROUGH)
     path = tmp_path_factory.mktemp("radius") / "r5.h5"
     run.save(path)
     return run, path

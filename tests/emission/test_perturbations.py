@@ -11,7 +11,6 @@ from scipy import stats
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap._common.ion_random import IonRandom
-from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
 from apt_evap.emission.emissions import Emissions, Launches, TangentialLaunches
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import (
@@ -24,6 +23,7 @@ from apt_evap.emission.perturbations import (
     perturbation_of,
 )
 from apt_evap.emission.surface_frame import launch_tangentially, rollup_direction, tangent_frame
+from apt_evap.simulation.config.perturbation_text import read_perturbation, title_of, write_perturbation
 from apt_evap.units import SPEED
 
 D = 0.249

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
 from apt_evap.evaporation.cap import FEWEST, measure_cap
 from apt_evap.evaporation.emitter import Emitter
+from apt_evap.simulation.config.simulation_file import read_config
 
 TIP = """
 [tip]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
 from apt_evap.explore.background_run import BackgroundRun
+from apt_evap.simulation.config.simulation_file import read_config
 
 SECONDS = 120  # until a test gives up: the machine may be busy
 SETTINGS = """

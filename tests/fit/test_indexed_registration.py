@@ -15,9 +15,9 @@ from apt_evap.fit.indexed_registration import (
     register_near,
 )
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.index_map import Candidate, Indexing
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.specimen.symmetry import point_group
 from apt_evap.workflows import compare_maps
 
 PROJECTION = ae.detection.Projection(60.0, centre=(3.0, -2.0), compression=1.5)

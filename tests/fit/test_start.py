@@ -11,9 +11,9 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import read_config
 from apt_evap.fit.start_settings import FIELD_FACTOR, MARK, registration_start_of
-from apt_evap.maps.crystallography.symmetry import point_group
+from apt_evap.simulation.config.simulation_file import read_config
+from apt_evap.specimen.symmetry import point_group
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import zones
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing import contrast_search as module
 from apt_evap.maps.indexing.contrast_search import (
     PIECES,
@@ -21,6 +20,7 @@ from apt_evap.maps.indexing.joint_search import CONTRAST, JointSearch
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, misorientation
 from apt_evap.maps.indexing.refine import directions_of
+from apt_evap.specimen.symmetry import point_group
 
 SCALE, WIDTH = 60.0, 70.0
 FINE = 2.5, 0.07  # steps of the axes [degrees] and of the logarithm of the scale

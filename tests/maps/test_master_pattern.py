@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
+from apt_evap.specimen.symmetry import point_group
 
 
 @pytest.fixture(scope="module")
@@ -13,7 +14,9 @@ def run(nickel, made_once):
     tip = ae.Tip(nickel, 9 * nickel.a, axis=(0.36, 0.52, 0.775), shank_length=12 * nickel.a, offset_seed=1)
     detector = ae.Detector(distance=100.0, width=500.0, projection="equidistant")
     emissions = [ae.LateralVelocity(0.2), ae.RollUp(0.2), ae.Unperturbed()]
-    return made_once(tip, 3_000, emissions, responses=False, seed=1, detector=detector)
+    return made_once(
+        tip, 3_000, emissions, responses=False, seed=1, detector=detector, flight_settings=ROUGH["flight_settings"]
+    )
 
 
 def random_directions(rng, n):

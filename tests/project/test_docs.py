@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"

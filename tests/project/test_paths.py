@@ -6,7 +6,6 @@ import importlib.util
 import inspect
 import re
 import sys
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -70,31 +69,37 @@ def test_what_a_text_names_exists(path):
                     assert exists(f"{node.module}.{item.name}".removeprefix("apt_evap.")), (node.module, item.name)
 
 
-NAMES = ("id", "attr", "name", "arg", "asname", "module")  # of the nodes of a syntax tree
-tree_of = cache(lambda path: ast.parse(path.read_text()))
+# fields of the nodes of a syntax tree that hold names
+NAMES = {ast.Name: ("id",), ast.Attribute: ("attr",), ast.arg: ("arg",), ast.keyword: ("arg",)}
+NAMES |= {ast.FunctionDef: ("name",), ast.ClassDef: ("name",), ast.ExceptHandler: ("name",)}
+NAMES |= {ast.alias: ("name", "asname"), ast.ImportFrom: ("module",)}
 
 
-def identifiers():
-    """Names of the code of the package, its modules and folders; words of its texts and comments do not count."""
-    words = set(sys.stdlib_module_names) | {"apt_evap", "scipy"}
-    for path in PACKAGE.rglob("*"):
-        words.add(path.stem)
-        if path.suffix in (".py", ".pyi"):
-            for node in ast.walk(tree_of(path)):
-                for value in (getattr(node, name, None) for name in NAMES):
-                    words |= set(value.split(".")) if isinstance(value, str) else set()
-        elif path.suffix in (".pyx", ".pxd"):
-            words |= set(re.findall(r"\w+", path.read_text()))
-    return words
+def names_and_texts(path):
+    """Names of the code of a file, which words of its texts and comments are not, and its texts."""
+    names, texts = set(), []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if type(node) is ast.Constant:
+            if isinstance(node.value, str):
+                texts.append(node.value)
+        else:
+            names.update(getattr(node, name) or "" for name in NAMES.get(type(node), ()))
+    return {part for name in names for part in name.split(".")}, texts
 
 
 def test_names_in_backticks_exist():
     """A name of the package in a page or a docstring occurs in its code, so none is left of an earlier version."""
     texts = {path: [path.read_text()] for path in TEXTS if path.suffix == ".rst"}
-    for path in PACKAGE.rglob("*.py"):
-        nodes = ast.walk(tree_of(path))
-        texts[path] = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-    words = identifiers()
+    words = set(sys.stdlib_module_names) | {"apt_evap", "scipy"}
+    for path in PACKAGE.rglob("*"):
+        words.add(path.stem)
+        if path.suffix in (".py", ".pyi"):
+            names, strings = names_and_texts(path)
+            words |= names
+            if path.suffix == ".py":
+                texts[path] = strings
+        elif path.suffix in (".pyx", ".pxd"):
+            words |= set(re.findall(r"\w+", path.read_text()))
     assert len(words) > 3_000
     for path, parts in texts.items():
         for name in re.findall(r"(?<![`\w:])`([A-Za-z_][\w.]*)`(?![`_])", "\n".join(parts)):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 
 FINGERPRINT = "16ccf415bca87587c576f279d69d2d00ef0b06c13ffee01b3558b16724474175"
 PROGRAM = """

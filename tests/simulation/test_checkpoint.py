@@ -20,7 +20,7 @@ from systems import FORK, LINKS, MODES, PIPES
 from tqdm.auto import tqdm
 
 import apt_evap as ae
-from apt_evap._common.locks import FileLock
+from apt_evap.simulation.locks import FileLock
 
 ENERGY = ae.TruncatedNormal(0.155, 0.155)
 HERE = str(Path(ae.__file__).parents[1])  # the package under test, installed or not

@@ -13,7 +13,9 @@ def run_with_rises(small_tip, monkeypatch):
     with_rises = (*columns.ALWAYS, columns._of_events("events/rises"))
     for module in (columns, run_hdf5):
         monkeypatch.setattr(module, "ALWAYS", with_rises)
-    return ae.Simulation(small_tip, seed=1, law=ae.Arrhenius(60.0)).run(300, progress=False)
+    return ae.Simulation(small_tip, seed=1, law=ae.Arrhenius(60.0)).run(
+        300, [ae.Unperturbed()], responses=False, progress=False
+    )
 
 
 def test_a_column_of_the_events_is_stored_by_one_line(run_with_rises, tmp_path):

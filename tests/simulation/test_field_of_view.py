@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.config.simulation_file import read_config
 from apt_evap.detection import Outcome
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.flight.field_of_view import scouts_of, stereographic_rim
 from apt_evap.warnings import ResponseWarning, RunWarning
 

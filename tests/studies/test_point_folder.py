@@ -10,8 +10,8 @@ import sys
 import pytest
 from sweeps import check_bits, check_done, do, planned, poison
 
-from apt_evap._common.locks import try_lock
 from apt_evap.cli.main import main
+from apt_evap.simulation.locks import try_lock
 from apt_evap.studies.sweep import point_folder
 from apt_evap.studies.sweep.planning import plan_sweep, retry, sweep_status
 from apt_evap.studies.sweep.point_folder import run_point
@@ -70,7 +70,7 @@ def test_a_run_that_another_program_writes_is_no_failure(sweep):
     """`apt-evap run`, started by Snakemake, locks its run but not the point."""
     folder = sweep.folder_of(sweep.keys[0])
     program = (
-        "import sys; from apt_evap.config.simulation_file import read_config\n"
+        "import sys; from apt_evap.simulation.config.simulation_file import read_config\n"
         "config = read_config(sys.argv[1] + '/settings.toml')\n"
         "def wait(ions, all_ions): print('runs', flush=True); sys.stdin.read()\n"
         "config.simulation().run(60, progress=wait, checkpoint=sys.argv[1] + '/run.h5')"

@@ -6,7 +6,7 @@ from sweeps import check_bits, do, planned, write_dump
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.studies.sweep.planning import open_sweep, plan_sweep
 from apt_evap.studies.sweep.point_folder import run_point
 

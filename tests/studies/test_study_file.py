@@ -5,7 +5,7 @@ import pytest
 from sweeps import BASE
 
 from apt_evap._common.files import FileError
-from apt_evap.config.simulation_file import key_of
+from apt_evap.simulation.config.simulation_file import key_of
 from apt_evap.studies.sweep.planning import plan_sweep
 from apt_evap.studies.sweep.study_file import JobSettings, read_study, value_at, with_values
 

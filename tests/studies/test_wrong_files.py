@@ -16,9 +16,9 @@ from sweeps import check_done, command, do, planned, write_dump
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
-from apt_evap.config.simulation_file import key_of
 from apt_evap.plot.report.html_page import read_report
 from apt_evap.simulation.checkpoint import Checkpoint
+from apt_evap.simulation.config.simulation_file import key_of
 from apt_evap.studies.sweep.collection import collect_sweep
 from apt_evap.studies.sweep.planning import open_sweep, plan_sweep, retry, sweep_status
 from apt_evap.studies.sweep.point_folder import run_point
@@ -105,7 +105,7 @@ def test_the_unfinished_run_of_another_point_is_not_continued(fresh, part):
         (other / part).rename(one / part)
     else:
         program = (
-            "import sys; from apt_evap.config.simulation_file import read_config\n"
+            "import sys; from apt_evap.simulation.config.simulation_file import read_config\n"
             "from apt_evap.simulation.checkpoint import Checkpoint; import os\n"
             "simulation = read_config(sys.argv[1] + '/settings.toml').simulation(n_threads=1)\n"
             "def kill(ions, all_ions): ions < 10 or os.kill(os.getpid(), 9)\n"

@@ -16,9 +16,9 @@ import apt_evap as ae
 from apt_evap.cli._files import measured_source
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
-from apt_evap.config.simulation_file import read_config
 from apt_evap.fit.measured_map import FEWEST_IONS, bins_for_run, measured_map
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import warn
 from apt_evap.workflows import kept_files, twin_of_map

@@ -110,7 +110,7 @@ def test_a_table_that_is_a_number_is_one_sentence(folder, capsys, options):
 @pytest.fixture(scope="module")
 def pair(small_tip, made_once):
     """A run, and what would have been measured of the same ions with other random numbers."""
-    run = made_once(small_tip, 1000, seed=1, **ROUGH)
+    run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1000]
     hits = replace(run, seed=2).hits(ae.RollUp(ae.TruncatedNormal(0.2, 0.1))).within_circle(60.0)
     return run, hits.map(bins=24, extent=(-60, 60, -60, 60))
 

@@ -143,10 +143,6 @@ class Lens:
         to_electrode : bool
             Whether the flights end before the electrode.
 
-        Returns
-        -------
-        Flights
-
         Notes
         -----
         The equation of motion in the logarithm of the time, by `scipy.integrate.solve_ivp` (DOP853). The first 4 % of

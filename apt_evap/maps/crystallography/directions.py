@@ -168,18 +168,13 @@ def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -
     -------
     ndarray
         Shape (n, 3).
-
-    Raises
-    ------
-    ValueError
-        If indices are all zero, or if the sum rule for hcp is violated.
     """
     planes = _three(material, planes, name, lambda h, k, _, last: (h, k, last))
     normals = planes @ _reciprocal(material)
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
-def direction_normals(material: Material, directions: ArrayLike, name: str = "directions") -> Floats:
+def direction_normals(material: Material, directions: ArrayLike) -> Floats:
     """Unit vectors along lattice directions, in the frame of the crystal.
 
     Parameters
@@ -188,20 +183,13 @@ def direction_normals(material: Material, directions: ArrayLike, name: str = "di
         The crystal.
     directions : array_like
         [u v w], shape (n, 3), or for hcp also [u v t w] with u + v + t = 0, shape (n, 4).
-    name : str
-        Name of the argument, for the message.
 
     Returns
     -------
     ndarray
         Shape (n, 3).
-
-    Raises
-    ------
-    ValueError
-        If indices are all zero, or if the sum rule for hcp is violated.
     """
-    directions = _three(material, directions, name, lambda u, v, t, w: (u - t, v - t, w))
+    directions = _three(material, directions, "directions", lambda u, v, t, w: (u - t, v - t, w))
     vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]
 

@@ -19,9 +19,9 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_sequence, check_switch, short_text
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.directions import plane_normals, poles
-from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry
 from apt_evap.specimen import lattice
 from apt_evap.specimen.materials import as_material
+from apt_evap.specimen.symmetry import point_group, pole_symmetry
 
 _ROUNDING = 1e-9  # sines below this come from rounding
 _SAME = math.radians(0.1)  # directions closer than this count as one

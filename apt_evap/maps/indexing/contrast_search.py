@@ -284,10 +284,6 @@ def refine_contrast(
         Orientation and scale.
     bounds : tuple of float
         Bounds of the scale [mm/rad].
-
-    Returns
-    -------
-    Explained
     """
     places, areas = places_of()
     limits = np.log(bounds)

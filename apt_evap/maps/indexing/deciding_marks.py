@@ -23,13 +23,6 @@ class _Spot(NamedTuple):
 def deciding_marks(map: DetectorMap, candidates: Sequence[tuple[Orientation, Projection]]) -> tuple[str, ...]:
     """Name for each orientation the pole that distinguishes it best from the others.
 
-    Parameters
-    ----------
-    map : DetectorMap
-        The map.
-    candidates : sequence of Orientation and Projection
-        The orientations.
-
     Returns
     -------
     tuple of str

@@ -22,13 +22,13 @@ import numpy as np
 import scipy
 
 from apt_evap._common.types import Floats
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.contrast_search import PIECES, Terms, exact_evidence, places_of, refine_contrast
 from apt_evap.maps.indexing.joint_search import JOINT, JointSearch
 from apt_evap.maps.indexing.master_pattern import sampled
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Start, about_axis, axes_of, polar_grid
 from apt_evap.maps.indexing.refine import Refined, directions_of, refine
 from apt_evap.maps.indexing.two_criteria import View
+from apt_evap.specimen.symmetry import point_group
 
 HALVES = 8
 """Half discs, 45 degrees apart."""
@@ -55,15 +55,6 @@ def second_lattice(view: View, terms: Terms, fit: Refined) -> tuple[float, float
     """Evidence of the local contrast for a second lattice, and that of the winner in the half where it has least.
 
     The first one is the largest evidence of another orientation over that of the winner, or of no crystal, in any half.
-
-    Parameters
-    ----------
-    view : View
-        The map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    fit : Refined
-        The winner.
     """
     windows = _windows()
     pictures = _in_windows(view.picture, windows)
@@ -183,17 +174,7 @@ class SecondGrain(NamedTuple):
 
 
 def second_grain(view: View, terms: Terms, fit: Refined) -> SecondGrain:
-    """Likelihood of another orientation in a segment of the disc, with the amplitudes of the winner.
-
-    Parameters
-    ----------
-    view : View
-        The map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    fit : Refined
-        The winner.
-    """
+    """Likelihood of another orientation in a segment of the disc, with the amplitudes of the winner."""
     places, areas = places_of()
     radius, picture = view.disc.radius, view.picture
     # what the winner shows in any direction of the crystal, and the variance that it leaves

@@ -18,7 +18,6 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.folded_map import FoldedMap, folded
 from apt_evap.maps.gains import Densities, DensityGains, density_gains
 from apt_evap.maps.indexing.contrast_search import Terms, terms_of
@@ -32,6 +31,7 @@ from apt_evap.maps.indexing.orientation_search import Start, UnusableMap, disc_o
 from apt_evap.maps.indexing.refine import resolution
 from apt_evap.maps.indexing.two_criteria import View, Weighed, angle_between, dispersion_of, view_of, weighed
 from apt_evap.specimen.materials import Material, as_material
+from apt_evap.specimen.symmetry import point_group
 
 WIDEST, NARROWEST = 45.0, 12.0
 """Half angles of the field of view between which the scale is searched, if it is not known [degrees]."""

@@ -17,7 +17,6 @@ import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.contrast_search import PIECES, Terms, places_of
 from apt_evap.maps.indexing.marked_poles import Mark, rotations_misfit
 from apt_evap.maps.indexing.master_pattern import MasterPattern
@@ -37,6 +36,7 @@ from apt_evap.maps.indexing.orientation_search import (
     slow_changes,
 )
 from apt_evap.maps.indexing.refine import directions_of
+from apt_evap.specimen.symmetry import point_group
 
 AXIS_STEP, SCALE_STEP = 3.5, 0.10
 """Steps of the search: of the axes [degrees], and of the logarithm of the scale."""

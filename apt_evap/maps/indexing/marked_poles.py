@@ -197,7 +197,7 @@ def contradictory_marks(marks: Sequence[Mark], deviations: Floats) -> str:
 def _family(material, indices, name):
     """Normals of all members of a family of planes."""
     from apt_evap.maps.crystallography.directions import plane_normals
-    from apt_evap.maps.crystallography.symmetry import point_group
+    from apt_evap.specimen.symmetry import point_group
 
     (normal,) = plane_normals(material, [indices], name)
     members = point_group(material.structure) @ normal

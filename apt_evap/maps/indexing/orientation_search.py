@@ -14,8 +14,8 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap.detection.binning import field_of_view
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.noise import effective_ions
+from apt_evap.specimen.symmetry import point_group
 
 RINGS, AZIMUTHS = 20, 96
 """Points of a polar picture."""
@@ -231,11 +231,6 @@ def distinct_starts(
         Largest number of results.
     axis_step, scale_step : float
         Steps of the search: of the axes [degrees], and of the logarithm of the scale.
-
-    Returns
-    -------
-    list of Start
-        The best first.
     """
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []

@@ -140,7 +140,7 @@ def bins_of(disc: Disc) -> Bins:
     fit += np.linalg.lstsq(slow, np.full(len(slow), np.log(mean)), rcond=None)[0]
     mu = np.exp(slow @ fit)
     for _ in range(_STEPS):
-        step = _solve(slow * mu[:, None], counts - mu, 1 / mu)[0]
+        step = _solve(slow * mu[:, None], counts - mu, 1 / mu)
         fit += np.clip(step, -1, 1)
         mu = np.exp(np.clip(slow @ fit, -20, 20))
     return Bins(inside, places, counts, slow, fit, mu)
@@ -165,13 +165,11 @@ def directions_of(places: Floats, radius: float, scale: float, stretch: float) -
     return np.column_stack([x * across, y * across, np.cos(theta)])
 
 
-def _solve(columns, residuals, weights, prior=None):
+def _solve(columns, residuals, weights):
     normal = columns.T @ (columns * weights[:, None])
     right = columns.T @ (residuals * weights)
-    if prior is not None:
-        normal = normal + np.diag(prior)
     normal = normal + 1e-9 * np.trace(normal) / len(normal) * np.eye(len(normal))
-    return np.linalg.solve(normal, right), normal
+    return np.linalg.solve(normal, right)
 
 
 class _State(NamedTuple):
@@ -346,10 +344,6 @@ def refine(
         Largest number of iterations.
     bounds : tuple of float, optional
         Bounds of the scale at the centre [mm/rad].
-
-    Returns
-    -------
-    Refined
     """
     geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
     if bounds is not None:

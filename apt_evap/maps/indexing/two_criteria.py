@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Floats
-from apt_evap.maps.crystallography.symmetry import point_group
 from apt_evap.maps.indexing.contrast_search import Explained, Terms, picture_of, places_of, refine_contrast
 from apt_evap.maps.indexing.marked_poles import Mark
 from apt_evap.maps.indexing.orientation_search import Disc, Start, misorientation
 from apt_evap.maps.indexing.refine import Bins, Refined, bins_of, directions_of, refine
+from apt_evap.specimen.symmetry import point_group
 
 _SAME, _SAME_SCALE = 2.0, 0.05  # degrees, logarithm of the scale: starts that are nearer are refined once
 _QUICK, _STEPS = 7, 20  # of the refinements of all starts, and of the best ones
@@ -65,11 +65,6 @@ def angle_between(first: Refined | Explained, second: Refined | Explained, group
         Point group of the crystal, shape (n, 3, 3).
     radius : float
         Of the disc [mm].
-
-    Returns
-    -------
-    float
-        The smallest of all equal orientations.
     """
     places, areas = (values[::_EVERY] for values in places_of())
     one, two = (directions_of(places, radius, fit.scale, fit.stretch) @ fit.matrix for fit in (first, second))
@@ -108,11 +103,6 @@ def weighed(
         Marks of a user.
     known : dict, optional
         Refinements of the same map and crystal that are known already; those of this call are added.
-
-    Returns
-    -------
-    list of Weighed
-        Not sorted.
     """
     disc, bins, picture = view
     group = point_group(terms.structure)

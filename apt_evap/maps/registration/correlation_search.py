@@ -261,10 +261,6 @@ def refine(
         Lower and upper bound; equal bounds fix the value.
     shift_bounds : ShiftBounds, optional
         Bounds of the shift.
-
-    Returns
-    -------
-    Fit
     """
     pixel, broad = measured.diameter / pixels, BROAD * measured.diameter
     points = _square(measured.reach, pixel) + measured.centre

@@ -35,11 +35,6 @@ def patch_displacements(
         Complex of shape (n,) [mm].
     weights : ndarray
         r^2 / (1 - r^2) of the correlation coefficient r, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If fewer than 6 patches have a clear maximum.
     """
     pixel, broad = measured.diameter / FINE, BROAD * measured.diameter
     fixed = measured.flatten(NARROW * pixel, broad)

@@ -118,10 +118,6 @@ def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayL
         with enough points, are significant by an F test at 1 %, and reduce the residual of points that are left out.
     weights : array_like, optional
         Weights of the points, shape (n,); by default equal.
-
-    Returns
-    -------
-    PolynomialFit
     """
     source, target = np.asarray(source, complex), np.asarray(target, complex)
     n = len(source)

@@ -139,21 +139,7 @@ class Page:
         self._body += parts
 
     def picture(self, figure: Figure, caption: str = "", *, alt: str = "") -> str:
-        """Return a figure with its caption as HTML, with the picture inside.
-
-        Parameters
-        ----------
-        figure : matplotlib.figure.Figure
-            The figure, drawn with `DPI` dots per inch.
-        caption : str
-            Text below the picture.
-        alt : str
-            Text for readers without pictures; by default the caption.
-
-        Returns
-        -------
-        str
-        """
+        """Return a figure with its caption as HTML, with the picture inside."""
         file = io.BytesIO()
         figure.savefig(file, format="png", dpi=DPI, metadata={"Software": f"apt_evap {__version__}"})
         return self.image(file.getvalue(), caption, alt=alt)
@@ -185,18 +171,7 @@ class Page:
         self._data[name] = text
 
     def save(self, path: AnyPath) -> None:
-        """Write the page; the file is replaced only when complete.
-
-        Parameters
-        ----------
-        path : str or path-like
-            File to write or replace.
-
-        Raises
-        ------
-        FileError
-            If the file cannot be written.
-        """
+        """Write the page; the file is replaced only when complete."""
         size = f"Pictures: {self._picture_bytes / 1e6:.2g} MB with {DPI} dpi." if self._picture_bytes else ""
         text = _PAGE.substitute(
             title=escape(self.title),
@@ -217,21 +192,11 @@ class Page:
 def read_report(path: AnyPath) -> dict[str, Any]:
     """Read the data of a report.
 
-    Parameters
-    ----------
-    path : str or path-like
-        A file of `plot.write_study` or `plot.write_sweep`.
-
     Returns
     -------
     dict
         By name. Of a study: "study", as in study.json, and "origin", its command, files and warnings. Of a sweep:
         "points" and "origin".
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, or is not a report.
     """
     text = read_small_file(path, MAX_BYTES, "a report").decode(errors="replace")
     blocks = re.findall(r'^<script type="application/json" id="([^"]+)">(.*)</script>$', text, re.MULTILINE)

@@ -7,17 +7,7 @@ from apt_evap.plot.report.html_page import collapsed, paragraph, table
 
 
 def measurement_section(constants: Sequence[Any], checks: Sequence[Any], command: str = "", doubt: str = "") -> str:
-    """Folded section of a report with the constants of a measurement and their checks, as HTML.
-
-    Parameters
-    ----------
-    constants, checks : sequence of Constant, and of Observed
-        Those of a `Measurement`.
-    command : str
-        Command line that reconstructs with these constants.
-    doubt : str
-        Reason why constants are left out.
-    """
+    """Folded section of a report with the constants of a measurement and their checks, as HTML."""
     rows = [(constant.name, constant.text, constant.depends) for constant in constants]
     parts = [table(rows, ("", "value", "known only together with"))] if rows else []
     if doubt:

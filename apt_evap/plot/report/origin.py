@@ -20,20 +20,10 @@ from apt_evap.simulation.provenance import system
 def describe_file(path: AnyPath) -> dict[str, Any]:
     """Name, size and checksum of a file.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-
     Returns
     -------
     dict
         "name" without folders, "bytes" and "sha256".
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read.
     """
     path = check_path(path)
     with open_for_reading(path) as file:

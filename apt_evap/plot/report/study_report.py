@@ -120,11 +120,6 @@ def doubts(content: Mapping[str, Any]) -> list[str]:
     ----------
     content : dict
         Result of `Study.to_dict`, also read from study.json.
-
-    Returns
-    -------
-    list of str
-        Sentences.
     """
     settings, edges = content["settings"], content["optimum"]["at_edge"]
     others: list[str] = []

@@ -44,15 +44,7 @@ def stereographic_rim(half_angle: float) -> float:
 
 
 def scouts_of(emissions: Emissions, settings: ResponseSettings) -> Scouts:
-    """Scouts from the site and from the places of the roll-up.
-
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n.
-    settings : ResponseSettings
-        The launches that the responses cover.
-    """
+    """Scouts from the site and from the places of the roll-up."""
     corners = shares_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))  # of the places of a roll-up
     places = [emissions.positions[:, None], shared_positions(emissions, corners[None])]
     fastest = np.sqrt(2.0 * settings.energy_limit / emissions.charge_states)

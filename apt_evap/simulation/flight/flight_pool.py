@@ -259,11 +259,6 @@ def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -
         Start of each ion [nm].
     settings : FlightSettings
         Accuracy and end of the flights.
-
-    Returns
-    -------
-    Ends
-        One launch of each of n ions.
     """
     n, tree = len(positions), emitter.tree
     end, outcome, counter = np.empty((n, 7)), np.empty(n, np.int8), np.zeros(1, np.int64)

@@ -7,8 +7,8 @@ import numpy as np
 
 from apt_evap._common.codec import checked, choice, count, from_plain, settings, vector
 from apt_evap._common.validation import check_choice, check_kind, did_you_mean, short_text
-from apt_evap.config.perturbation_text import read_perturbation
 from apt_evap.detection.instrument import INSTRUMENT_PRESETS, Instrument
+from apt_evap.simulation.config.perturbation_text import read_perturbation
 from apt_evap.studies.dataset.fields import CHOICES
 from apt_evap.studies.sweep.sampling import drawn, has_options
 

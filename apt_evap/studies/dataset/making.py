@@ -15,10 +15,10 @@ import scipy
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError, check_path, is_unfinished, sha256_of
 from apt_evap._common.kept import check_made_from, digest_of
-from apt_evap._common.locks import FileLock
 from apt_evap._common.optional_imports import optional_import
 from apt_evap._common.types import AnyPath
 from apt_evap._common.version import __version__
+from apt_evap.simulation.locks import FileLock
 from apt_evap.simulation.run import load
 from apt_evap.studies.dataset.dataset_examples import examples_of, joined
 from apt_evap.studies.dataset.dataset_settings import MOST_EXAMPLES, SPLITS, DatasetSettings, read_instrument

@@ -16,7 +16,7 @@ from apt_evap._common.files import FileError, check_path, read_small_file, repla
 from apt_evap._common.kept import first_difference
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_choice, check_count, short_text
-from apt_evap.config.tables import check_keys, check_table
+from apt_evap.simulation.config.tables import check_keys, check_table
 from apt_evap.studies.dataset.dataset_settings import SPLITS, DatasetSettings
 from apt_evap.studies.dataset.datasheet import datasheet
 from apt_evap.studies.dataset.fields import chosen_tables

@@ -8,11 +8,11 @@ from typing import Any
 from apt_evap._common.codec import declared, from_plain, to_plain
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.validation import check_number, short_text
-from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import EnergyGrid
+from apt_evap.simulation.config.tables import check_keys, check_table
 from apt_evap.simulation.read_file import read
 
 _READING = ("format", "byte_order", "unit")

@@ -16,11 +16,11 @@ from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import short_text
 from apt_evap._common.version import __version__
-from apt_evap.config.cost_estimate import CostEstimate
-from apt_evap.config.simulation_file import config_of, key_of
-from apt_evap.config.simulation_settings import Config
-from apt_evap.config.tables import check_table
-from apt_evap.config.toml_text import comment, toml_text
+from apt_evap.simulation.config.cost_estimate import CostEstimate
+from apt_evap.simulation.config.simulation_file import config_of, key_of
+from apt_evap.simulation.config.simulation_settings import Config
+from apt_evap.simulation.config.tables import check_table
+from apt_evap.simulation.config.toml_text import comment, toml_text
 from apt_evap.studies.sweep.compare_settings import CompareSettings
 from apt_evap.studies.sweep.point_folder import (
     SETTINGS,

@@ -16,10 +16,10 @@ from typing import Any
 
 from apt_evap._common.checked_hdf5 import label_of
 from apt_evap._common.files import FileError, check_path, read_small_file, replace_file
-from apt_evap._common.locks import open_lock, try_lock
 from apt_evap._common.types import AnyPath
-from apt_evap.config.simulation_file import config_of, key_of, read_document
 from apt_evap.simulation.checkpoint import Checkpoint
+from apt_evap.simulation.config.simulation_file import config_of, key_of, read_document
+from apt_evap.simulation.locks import open_lock, try_lock
 
 SETTINGS, RUN, WORK, LOCK = "settings.toml", "run.h5", "work.json", "lock"
 """Files of a point."""

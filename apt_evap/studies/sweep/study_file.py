@@ -14,10 +14,10 @@ from apt_evap._common.codec import count, from_plain, number, settings
 from apt_evap._common.files import FileError, check_path, sha256_of
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_count, check_seed, short_text
-from apt_evap.config.cost_estimate import CostEstimate, estimate_cost
-from apt_evap.config.simulation_file import config_of, key_of, read_document
-from apt_evap.config.simulation_settings import Config
-from apt_evap.config.tables import check_keys, check_table
+from apt_evap.simulation.config.cost_estimate import CostEstimate, estimate_cost
+from apt_evap.simulation.config.simulation_file import config_of, key_of, read_document
+from apt_evap.simulation.config.simulation_settings import Config
+from apt_evap.simulation.config.tables import check_keys, check_table
 from apt_evap.studies.sweep.compare_settings import CompareSettings
 from apt_evap.studies.sweep.sampling import AXIS, RandomAxis, option_of, samples
 

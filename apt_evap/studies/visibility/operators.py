@@ -18,9 +18,9 @@ from apt_evap._common.files import FileError
 from apt_evap._common.kept import check_made_from
 from apt_evap._common.types import AnyPath, Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_seed
-from apt_evap.config.tables import check_table
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.simulation.config.tables import check_table
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip

@@ -10,10 +10,10 @@ from apt_evap._common.codec import checked, count, from_plain, number, part, set
 from apt_evap._common.files import FileError
 from apt_evap._common.kept import check_made_from
 from apt_evap._common.validation import check_array, check_choice, short_text
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.config.simulation_file import config_of, read_document
-from apt_evap.config.tables import check_keys, check_table
 from apt_evap.detection.instrument import Instrument
+from apt_evap.simulation.config.perturbation_text import read_perturbation
+from apt_evap.simulation.config.simulation_file import config_of, read_document
+from apt_evap.simulation.config.tables import check_keys, check_table
 from apt_evap.specimen.phases import Phase
 from apt_evap.specimen.tip import Tip
 from apt_evap.studies.visibility.operators import REMEDY, OriginOperators, default_axes, grid_of, origin_operators

@@ -11,8 +11,8 @@ import pytest
 import apt_evap as ae
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
-from apt_evap.config.perturbation_text import read_perturbation
-from apt_evap.config.simulation_file import config_of, read_config, read_document
+from apt_evap.simulation.config.perturbation_text import read_perturbation
+from apt_evap.simulation.config.simulation_file import config_of, read_config, read_document
 
 MODULE = '''
 from __future__ import annotations

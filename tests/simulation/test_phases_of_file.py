@@ -5,7 +5,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.files import FileError
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.simulation_file import read_config
 
 TEXT = """
 [tip]

@@ -8,8 +8,6 @@ from typing import Any
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import sha256_of
 from apt_evap._common.validation import check_count, check_kind, check_seed, check_switch, short_text
-from apt_evap.config.map_panels import MapSettings
-from apt_evap.config.tables import located
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import field_of_view
@@ -20,6 +18,8 @@ from apt_evap.evaporation.law import Law, check_law
 from apt_evap.evaporation.rule import CompiledRule, Rule, check_rule
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
 from apt_evap.io.specimens import read_tip
+from apt_evap.simulation.config.map_panels import MapSettings
+from apt_evap.simulation.config.tables import located
 from apt_evap.simulation.flight.flight_pool import WHOLE_DETECTOR, FlightSettings
 from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import Monitor

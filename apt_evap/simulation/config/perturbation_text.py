@@ -5,9 +5,9 @@ from typing import Any
 
 from apt_evap._common.codec import declared, is_settings, to_plain, to_python
 from apt_evap._common.validation import short_text
-from apt_evap.config.toml_text import inline, read_toml
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, perturbation_of
+from apt_evap.simulation.config.toml_text import inline, read_toml
 
 
 def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
@@ -20,11 +20,6 @@ def read_perturbation(settings: str | Mapping[str, Any]) -> Perturbation:
         as energy is the same for every ion [eV]. As text: the name alone, ``"RollUp:0.2"`` for equal energies,
         ``"RollUp:0.3,0.1"`` for mean and standard deviation [eV], ``"Combined:0.3,0.1,0.75"`` with the rollup_fraction
         at the end, or the table in TOML syntax.
-
-    Raises
-    ------
-    ValueError
-        If a name is unknown, or a parameter is unknown, missing or outside its range.
     """
     if isinstance(settings, str):
         try:
@@ -62,20 +57,10 @@ def _perturbation_table(text):
 def write_perturbation(perturbation: Perturbation) -> str:
     """Text of a built-in perturbation that `read_perturbation` reads.
 
-    Parameters
-    ----------
-    perturbation : perturbation
-        With any of the built-in energy distributions.
-
     Returns
     -------
     str
         The short form, such as ``"RollUp:0.155,0.155"``, or a table in TOML syntax.
-
-    Raises
-    ------
-    ValueError
-        If the perturbation is not a built-in one.
     """
     settings = to_plain(perturbation, short=True)
     numbers = list(_numbers_of(settings))

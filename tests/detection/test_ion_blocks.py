@@ -9,8 +9,9 @@ import pytest
 
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
+from apt_evap.detection import ion_blocks
 from apt_evap.detection.hits import Hits
-from apt_evap.io import formats, ion_blocks
+from apt_evap.io import formats
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.plot import spectra
 from apt_evap.reconstruction import cap_geometry
@@ -18,7 +19,7 @@ from apt_evap.reconstruction.reconstruct import reconstruct
 
 pytestmark = pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
 N = 20_000
-SIZES = (101, 977, 1 << 14, 1 << 20)
+SIZES = (101, 1 << 14, 1 << 20)
 
 
 def rows_of(n=N, seed=3):
@@ -162,21 +163,32 @@ def test_blocks_give_the_map_of_the_whole_file(tmp_path, monkeypatch, blocks_of,
     assert expected["detected"] > 0
 
 
+@pytest.mark.usefixtures("rough_layout", "spectra_once")
 @pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
 def test_blocks_give_the_spectrum_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
     """The picture, too; what is said of pulses and voltages, which a spectrum does not need, may be missing."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.epos").write_bytes(FILES[name])
-    words = ["a.epos", *OPTIONS.get(name, ())]
+    words = ["a.epos"] if name == "plain" else ["a.epos", "--element", "Al,H"]  # all elements are tried once
     whole = None
     for rows in (None, 977, 1 << 20):
         blocks_of(rows)
         given = [answers(capsys, "spectrum", *words, "-o", "s.png", "--json")[:2], (tmp_path / "s.png").read_bytes()]
-        given.append(answers(capsys, "composition", *words, "--element", "Al,H", "--json")[:2])
+        given.append(answers(capsys, "composition", "a.epos", "--element", "Al,H", "--json")[:2])
         whole = whole or given
         assert given == whole, rows
     assert json.loads(whole[0][1])["ions"]
     assert json.loads(whole[2][1])["composition"]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 101, 1000])
+def test_the_sample_of_blocks_is_that_of_all_ions(monkeypatch, rows):
+    monkeypatch.setattr(ion_blocks, "SAMPLE", 300)
+    x, y = np.random.default_rng(1).random((2, 1000))
+    field = ion_blocks.Field(len(x))
+    for start in range(0, len(x), rows):
+        field.add(x[start : start + rows], y[start : start + rows])
+    assert all(map(np.array_equal, field.sample, (x[::3], y[::3])))
 
 
 def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
@@ -190,7 +202,7 @@ def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, cap
     rows.view(">f4")[:, 3] = mass
     (tmp_path / "a.epos").write_bytes(rows.tobytes())
     given = []
-    for size in (None, *SIZES[1:]):
+    for size in (None, 977, *SIZES[1:]):
         blocks_of(size)
         given.append(answers(capsys, "composition", "a.epos", "--element", "Cu"))
     assert "note" in given[0][2]
@@ -265,6 +277,7 @@ def test_counts_of_a_picture_are_those_of_numpy(dtype):
         assert all(np.array_equal(*pair) for pair in zip(spectra._in_daltons(values), expected, strict=True))
 
 
+@pytest.mark.usefixtures("rough_layout")
 @pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
 def test_blocks_give_the_reconstruction_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
     monkeypatch.chdir(tmp_path)

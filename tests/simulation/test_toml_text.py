@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apt_evap.config.toml_text import comment, toml_text
+from apt_evap.simulation.config.toml_text import comment, toml_text
 
 TEXT = st.text(st.characters(codec="utf-8"))
 NUMBERS = st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False)

@@ -8,10 +8,10 @@ import time
 import pytest
 
 from apt_evap._common.files import FileError
-from apt_evap._common.locks import FileLock, open_lock, try_lock
+from apt_evap.simulation.locks import FileLock, open_lock, try_lock
 
 HOLD = (
-    "import sys; from pathlib import Path; from apt_evap._common.locks import FileLock\n"
+    "import sys; from pathlib import Path; from apt_evap.simulation.locks import FileLock\n"
     "lock = FileLock(Path(sys.argv[1]), 'something'); print('locked', flush=True); sys.stdin.read(); lock.release()"
 )
 

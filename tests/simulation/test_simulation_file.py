@@ -12,15 +12,15 @@ from hypothesis import strategies as st
 
 from apt_evap._common.codec import from_plain, to_plain
 from apt_evap._common.files import FileError
-from apt_evap.config.map_panels import MapSettings, Panel
-from apt_evap.config.perturbation_text import read_perturbation, title_of
-from apt_evap.config.simulation_file import config_of, read_config, read_document
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Combined, LateralVelocity, Mixture, RollUp, Unperturbed
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.io.tapsim_nodes import write_nodes
+from apt_evap.simulation.config.map_panels import MapSettings, Panel
+from apt_evap.simulation.config.perturbation_text import read_perturbation, title_of
+from apt_evap.simulation.config.simulation_file import config_of, read_config, read_document
 from apt_evap.simulation.flight.flight_pool import FlightSettings
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import material

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import plane_normals, poles
-from apt_evap.maps.crystallography.symmetry import point_group, pole_symmetry, symmetry_about_axis
 from apt_evap.specimen.lattice import rotation_to_axis
+from apt_evap.specimen.symmetry import point_group, pole_symmetry, symmetry_about_axis
 
 
 @pytest.mark.parametrize(("structure", "order"), [("fcc", 48), ("bcc", 48), ("sc", 48), ("diamond", 48), ("hcp", 24)])

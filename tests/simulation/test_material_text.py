@@ -8,7 +8,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.cli.main import main
-from apt_evap.config.material_text import read_material, write_material
+from apt_evap.simulation.config.material_text import read_material, write_material
 
 OWN = 'name = "X", structure = "fcc", a = 0.38, evaporation_field = 45.0, charge_state = 2, mass = 190.0'
 LINES = OWN.replace(", ", "\n")

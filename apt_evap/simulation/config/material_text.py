@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import FileError
 from apt_evap._common.validation import short_text
-from apt_evap.config.simulation_file import read_document
-from apt_evap.config.toml_text import inline, read_toml
+from apt_evap.simulation.config.simulation_file import read_document
+from apt_evap.simulation.config.toml_text import inline, read_toml
 from apt_evap.specimen.materials import MATERIALS, Material, as_material, material, unknown_name
 
 _TABLE = "material"
@@ -23,11 +23,6 @@ def read_material(text: str, name: str = "material") -> Material:
         changed, or all fields of `Material`.
     name : str
         Name of the argument, for the message.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, or a field is unknown, missing or outside its range; FileError for a file.
     """
     if text.lower().endswith(".toml"):
         document = read_document(text)

@@ -52,12 +52,6 @@ def with_own_objects(document: Mapping[str, Any], folder: Path | None) -> dict[s
     dict
         The document, with an object for each table of a law, a rule, bonds, a perturbation, a distribution of energies,
         a probability or a region whose name is ``module:Class``; its other entries are the arguments of the class.
-
-    Raises
-    ------
-    ValueError
-        If there is such a table and no folder, it is not a class with the methods of the interface, or the module or
-        the class raises any error.
     """
     return {key: _with_objects(value, key, folder) for key, value in document.items()}
 

@@ -47,23 +47,7 @@ _TOO_DEEP = f"settings must have at most {MOST_LEVELS} levels of tables and list
 
 
 def toml_text(document: Mapping[str, Any]) -> str:
-    """Text of a TOML file with this content.
-
-    Parameters
-    ----------
-    document : mapping
-        Tables, lists, texts, numbers and booleans, as `tomllib` reads them.
-
-    Returns
-    -------
-    str
-        `tomllib.loads` of it gives the document.
-
-    Raises
-    ------
-    ValueError
-        If a value has another type, such as a date.
-    """
+    """Text of a TOML file with this content."""
     plain = [(key, value) for key, value in document.items() if not isinstance(value, Mapping)]
     tables = [(key, value) for key, value in document.items() if isinstance(value, Mapping)]
     lines = [f"{_key(key)} = {inline(value)}" for key, value in plain]

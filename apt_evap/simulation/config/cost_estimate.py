@@ -4,7 +4,7 @@ import math
 
 from apt_evap._common.codec import count, number, settings
 from apt_evap._common.memory import copied_memory, needed_memory
-from apt_evap.config.simulation_settings import Config
+from apt_evap.simulation.config.simulation_settings import Config
 from apt_evap.specimen.tip import estimated_atoms
 
 # Measured: resident memory of the program before a specimen is built, and after its pictures are drawn, 126 to 140 MB
@@ -55,15 +55,7 @@ def hours_text(hours: float) -> str:
 
 
 def estimate_cost(config: Config, threads: int) -> CostEstimate:
-    """Estimate memory and time of the run of a file of settings.
-
-    Parameters
-    ----------
-    config : Config
-        The settings.
-    threads : int
-        Threads of the run.
-    """
+    """Estimate memory and time of the run of a file of settings."""
     try:
         atoms, surface = estimated_atoms(**config.tip)
     except TypeError:  # a specimen without apex_radius

@@ -4,8 +4,8 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.codec import to_python
-from apt_evap.config.lens_text import read_lens
-from apt_evap.config.perturbation_text import read_perturbation, title_of, write_perturbation
+from apt_evap.simulation.config.lens_text import read_lens
+from apt_evap.simulation.config.perturbation_text import read_perturbation, title_of, write_perturbation
 
 NORMAL = ae.TruncatedNormal(0.155, 0.1)
 
@@ -53,6 +53,7 @@ def test_text_and_python_are_read_back(perturbation, text, python):
             "roll-up, 0.2 eV, probability Migration(4.44, 35.0)",
         ),
         (ae.Unperturbed(0.1), "unperturbed, height 0.1 nm"),
+        (ae.Combined(NORMAL, 0.75), "0.75 roll-up + 0.25 lateral, 0.155 ± 0.1 eV"),
     ],
 )
 def test_titles_name_the_options(perturbation, title):

@@ -20,11 +20,6 @@ _TOLERANCE = 1e-6  # of the axis: orientations by integers are exact to rounding
 def point_group(structure: str) -> Floats:
     """Rotations and reflections that map the lattice of a structure onto itself.
 
-    Parameters
-    ----------
-    structure : str
-        One of fcc, bcc, sc, diamond, hcp.
-
     Returns
     -------
     ndarray
@@ -57,19 +52,9 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
     direction : array_like
         In the Cartesian frame of the crystal, of any length, shape (3,).
 
-    Returns
-    -------
-    PoleSymmetry
-        `toward` has symmetric directions for symmetric poles, so that maps about them can be compared.
-
-    Raises
-    ------
-    ValueError
-        If the direction is zero.
-
     Examples
     --------
-    >>> from apt_evap.maps.crystallography.symmetry import pole_symmetry
+    >>> from apt_evap.specimen.symmetry import pole_symmetry
     >>> for direction in ((0, 0, 1), (1, 1, 1), (0, 1, 1), (1, 1, 3), (1, 2, 3)):
     ...     print(pole_symmetry(ae.material("Ni"), direction).name)
     4mm

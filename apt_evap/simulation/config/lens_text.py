@@ -5,8 +5,8 @@ from typing import Any
 
 from apt_evap._common.codec import from_plain
 from apt_evap._common.validation import check_kind, short_text
-from apt_evap.config.toml_text import read_toml
 from apt_evap.detection.microscope.local_electrode import ELECTRODE_PRESETS, LocalElectrode
+from apt_evap.simulation.config.toml_text import read_toml
 
 
 def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
@@ -18,14 +18,9 @@ def read_lens(settings: str | Mapping[str, Any]) -> LocalElectrode:
         Fields of `LocalElectrode`, perhaps with a ``preset`` whose other fields they replace. As text: the name of a
         preset and the fields that are changed, ``"local-electrode:shank_angle=7,distance=60e3"``.
 
-    Raises
-    ------
-    ValueError
-        If the preset is unknown, or a field is unknown, missing or outside its range.
-
     Examples
     --------
-    >>> from apt_evap.config.lens_text import read_lens
+    >>> from apt_evap.simulation.config.lens_text import read_lens
     >>> read_lens("local-electrode:shank_angle=7").shank_angle  # degrees
     7.0
     """

@@ -2,8 +2,8 @@
 
 import pytest
 
-from apt_evap.config.cost_estimate import estimate_cost
-from apt_evap.config.simulation_file import read_config
+from apt_evap.simulation.config.cost_estimate import estimate_cost
+from apt_evap.simulation.config.simulation_file import read_config
 
 BASE = """
 [tip]

@@ -12,18 +12,18 @@ from typing import Any
 from apt_evap._common.codec import from_plain, is_plain
 from apt_evap._common.files import FileError, check_path, read_small_file
 from apt_evap._common.validation import check_count, check_number, check_seed, check_switch, short_text
-from apt_evap.config.lens_text import read_lens
-from apt_evap.config.map_panels import MapSettings
-from apt_evap.config.own_classes import with_own_objects
-from apt_evap.config.simulation_settings import Config, host_of
-from apt_evap.config.tables import check_keys, check_table, located
-from apt_evap.config.toml_text import check_levels, read_toml
 from apt_evap.detection.detector import Detector
 from apt_evap.evaporation.charge_settings import ChargeSettings
 from apt_evap.evaporation.law import check_law
 from apt_evap.evaporation.rule import RULES, check_rule
 from apt_evap.evaporation.thermal import LAWS
 from apt_evap.evaporation.voltage import VoltageControl, check_voltage
+from apt_evap.simulation.config.lens_text import read_lens
+from apt_evap.simulation.config.map_panels import MapSettings
+from apt_evap.simulation.config.own_classes import with_own_objects
+from apt_evap.simulation.config.simulation_settings import Config, host_of
+from apt_evap.simulation.config.tables import check_keys, check_table, located
+from apt_evap.simulation.config.toml_text import check_levels, read_toml
 from apt_evap.simulation.flight.flight_pool import FlightSettings
 from apt_evap.simulation.flight.response import ResponseSettings
 from apt_evap.simulation.monitor import Monitor
@@ -111,11 +111,6 @@ def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False
         Name of the file, for messages.
     own_classes : bool
         Whether modules with classes of one's own are imported, as in `read_config`.
-
-    Raises
-    ------
-    FileError
-        If a table, key or value is wrong; the message names it.
     """
     with located(path):
         check_switch(own_classes, "own_classes")
@@ -206,11 +201,6 @@ def key_of(document: Mapping[str, Any]) -> str:
 
     The name of the output does not count, nor do the maps if the run has responses: they only select pictures then.
     The file of a specimen with a SHA-256 counts by this, not by its name. Numbers that are equal have equal keys.
-
-    Raises
-    ------
-    ValueError
-        If a table is missing or unknown, or a value is not of the types of JSON, such as a date.
     """
     _check_tables(document)
     document = {name: value for name, value in document.items() if name != "output"}

@@ -4,11 +4,11 @@ from typing import Any
 
 from apt_evap._common.codec import checked, count, from_plain, is_plain, number, settings
 from apt_evap._common.validation import check_kind, check_number, check_sequence, short_text
-from apt_evap.config.perturbation_text import read_perturbation, title_of
 from apt_evap.detection.binning import MAX_BINS
 from apt_evap.detection.detector import Detector
 from apt_evap.emission.energies import TruncatedNormal
 from apt_evap.emission.perturbations import RollUp, Unperturbed
+from apt_evap.simulation.config.perturbation_text import read_perturbation, title_of
 
 
 def _title(title, name):
