@@ -131,7 +131,11 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
     halves = ae.reconstruction.position_covariances(found, exact, local=(0.0, 0.0))
     local = ae.reconstruction.position_covariances(found, exact, local=(0.2, 0.1))
-    np.testing.assert_allclose(local - halves, np.broadcast_to(np.diag([0.04, 0.04, 0.01]), halves.shape), atol=1e-12)
+    # 0.2 nm along the surface and 0.1 nm across it
+    scatter = local - halves
+    assert np.linalg.eigvalsh(scatter) == pytest.approx(np.broadcast_to([0.01, 0.04, 0.04], (4000, 3)), abs=1e-12)
+    normals = even_flux(4000, HALF) * [1, 1, -1]  # of x, y and depth
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", scatter, normals), 0.01 * normals, atol=1e-6)
     # an even flux: the surface is the cap, and the distance from it is the error of the whole, here 0.7 of that told
     away = (found.specimen_positions - found.cap_positions)[:, 0].std()
     assert away < np.sqrt(halves[:, 0, 0].mean()) < 2 * away
@@ -140,8 +144,12 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     spread = found.depths[-1] / np.sqrt(12)
     assert np.sqrt(depth[:, 2, 2].mean()) == pytest.approx(spread * (1 - 1 / 1.1), rel=0.1)
     assert np.linalg.eigvalsh(local).min() > 0
-    across, along = ae.reconstruction.local_scatter(found, found.specimen_positions)
-    assert across == pytest.approx(0.0, abs=1e-12) and along == pytest.approx(0.0, abs=1e-12)
+    assert ae.reconstruction.local_scatter(found, found.specimen_positions) == pytest.approx((0, 0), abs=1e-12)
+    # ions that are moved along a sphere: far from the axis their depths change, their distance from its centre does not
+    normals = even_flux(4000, HALF)
+    moved = np.cross(normals, np.random.default_rng(3).normal(size=(4000, 3)))
+    along, across = ae.reconstruction.local_scatter(found, found.specimen_positions + 0.1 * moved)
+    assert along == pytest.approx(0.1, rel=0.05) and across < 0.02
     with pytest.raises(ValueError, match="constant_errors must be one of"):
         ae.reconstruction.position_covariances(found, {"colour": 0.1})
     with pytest.raises(ValueError, match="must have a surface that was followed, got 'cap: 50 ions"):
