@@ -53,8 +53,9 @@ def position_covariances(
 
     Notes
     -----
-    The sum of three parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
-    neighbours; the change by one standard error of each constant; and the local scatter, which comes from the emission
+    The sum of four parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
+    neighbours; the change by one standard error of each constant; what the recession is not sure about, see
+    `EvolvingReconstruction.recession_changes`; and the local scatter, which comes from the emission
     and the lattice and is not seen in any measurement. An ion whose place on the surface is wrong is moved along it:
     far from the axis this changes its depth, too.
     """
@@ -78,8 +79,13 @@ def position_covariances(
     near = scipy.spatial.cKDTree(sphere).query(sphere, k=_NEAR)[1]
     products = half[:, :, None] * half[:, None, :]
     total += products[near].mean(axis=1)
-    for name, error in errors.items():
-        change = reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual if error else 0 * usual
+    changes = reconstruction.recession_changes()
+    changes += [
+        reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual
+        for name, error in errors.items()
+        if error
+    ]
+    for change in changes:
         change -= change.mean(axis=0)
         total += change[:, :, None] * change[:, None, :]
     total *= np.array([1, 1, -1])[:, None] * np.array([1, 1, -1])  # depth in place of z

@@ -175,6 +175,37 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
 
 
+def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recession():
+    hits, _ = ions_of(voltage=varying())
+    places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
+    ball = np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 1.5
+    found, plain = evolving(hits, labels=ball.astype(int)), evolving(replace(hits, voltage=None))
+    assert found.verdict == "followed by the flux at the rim: at most 0.00 of it is of a phase"
+    np.testing.assert_array_equal(found.positions, plain.positions)
+    (phase,) = found.phases
+    # the voltage changes by 0.3 % about its mean
+    assert phase.ratio == pytest.approx(1.0, abs=0.03) and 0 < phase.error < 0.03
+    assert np.isfinite(found.history.model_voltage).all() and found.specimen("Al").phases[1:]
+    exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+    more, less = (ae.reconstruction.position_covariances(one, exact) for one in (found, plain))
+    (change,) = found.recession_changes()
+    change = (change - change.mean(axis=0)) * [1, 1, -1]
+    np.testing.assert_allclose(more - less, change[:, :, None] * change[:, None, :], atol=1e-12)
+    assert change[:, 2].std() > 0.001 and plain.recession_changes() == []
+
+
+def test_at_the_rim_the_errors_of_the_fields_are_those_of_the_recession():
+    hits, labels = ions_of(voltage=varying())
+    found = evolving(hits, labels=labels)
+    (change,) = found.recession_changes()
+    usual = found.again(found.sequence)
+    (phase,) = found.phases
+    np.testing.assert_array_equal(change, found.again(found.sequence, changes=[phase.error]) - usual)
+    # a field of the layer that is higher by 5 % changes what comes with the layer and after it
+    moved = found.again(found.sequence, changes=[0.05]) - usual
+    assert moved[:100, 2] == pytest.approx(0.0, abs=1e-6) and np.abs(moved[1700:, 2]).mean() > 0.005
+
+
 @pytest.mark.slow
 def test_a_phase_at_the_rim_that_is_not_flat_is_left_to_the_cap():
     hits, _ = ions_of(8000, voltage=varying(8000))
