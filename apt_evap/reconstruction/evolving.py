@@ -52,8 +52,8 @@ VOLTAGE_GATE = 0.02
 a layer of 1.15 times the field across the whole specimen."""
 
 VOLTAGE_ERROR = 0.017
-"""Relative error of V F = F_evap: RMS of V F / F_evap - 1 in the matrix of a pure specimen and of three with spheres, 0.007
-to 0.026, where the flux at the rim tells the recession without it."""
+"""Relative error of V F = F_evap: RMS of V F / F_evap - 1 in the matrix of a pure specimen and of three with spheres,
+0.007 to 0.026, where the flux at the rim tells the recession without it."""
 
 _WINDOW = 0.65  # of the radius: depth in which the trend is a straight line
 _FIRST_SHAPE = 0.065  # of the radius
