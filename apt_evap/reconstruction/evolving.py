@@ -280,9 +280,11 @@ class EvolvingReconstruction(Reconstruction):
             for one, change in zip(fixed.features, added, strict=True)
         ]
         fields = fixed.fields[rows] + sum(change * one.membership for one, change in zip(features, added, strict=True))
-        first = surface.integrate(voltages, fields, recession="mean")
-        outside = continued(features, first.positions, ions.in_ring)[0]
-        return surface.integrate(voltages, fields, outside, "surface").positions
+        places = fixed.positions[rows]
+        for _ in range(2):  # the phases where these ions were found, then where those of the changed sequence are
+            outside = continued(features, places, ions.in_ring)[0]
+            places = surface.integrate(voltages, fields, outside, "surface").positions
+        return places
 
     def recession_changes(self) -> list[Floats]:
         """What the recession of the sphere is not sure about: changes of the positions of `sequence` [nm].
@@ -613,8 +615,6 @@ def _fixed_point(measured):
             f"a phase reaches the rim of the field of view, {max(way.share for way in rough):.2f} of the ring, "
             f"and is not flat: its thickness is {flatness:.2f} of its extent, above {FLAT_GATE:g}"
         )
-    if by == "surface":  # continued by itself again and again, a phase thickens: a low layer on a shank 1.11 for 1.085
-        before = surface.integrate(voltages / level, thresholds, recession="mean").positions
     return _Fixed(by, level, trend, features, contrasts, thresholds, before, ways, ratios, errors)
 
 
