@@ -4,7 +4,7 @@ Runs with a known truth
 
 Specimens of aluminium with phases of other evaporation fields, evaporated at a constant potential, and what a detector
 sees of them. Each run is one file ``NAME_SEED.npz`` with the sites, phases and species of all atoms in sequence, their
-landing places, and the voltage at which each site would have left. A run of R = 12 nm takes 3.1 to 3.4 minutes of
+landing places, and the voltage at which each site would have left. A run of R = 12 nm takes 3.1 to 3.3 minutes of
 processor time on an EPYC. ``python runs.py NAME:SEED ... -o FOLDER`` makes those that the folder does not have;
 ``NAME:1-5`` are five seeds. Without names, the list of all.
 """
