@@ -9,9 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_array, check_kind
+from apt_evap._common.validation import check_kind
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
-from apt_evap.reconstruction.position_errors import LOCAL_SCATTER, changed_sequence, constant_errors_of
+from apt_evap.reconstruction.position_errors import (
+    LOCAL_SCATTER,
+    changed_sequence,
+    constant_errors_of,
+    local_covariances,
+)
 
 _FEWEST = 50  # ions of a phase
 _FAR = 1.6  # times the ellipsoid: ions farther out are strays
@@ -57,7 +62,7 @@ def phase_sizes(
     constant_errors : mapping, optional
         Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
     local : sequence of float
-        Scatter of the ions along x and y, and in depth [nm], as for `position_covariances`; it widens a phase.
+        Scatter of the ions along the surface and across it [nm], as for `position_covariances`; it widens a phase.
 
     Returns
     -------
@@ -78,10 +83,10 @@ def phase_sizes(
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
     errors = constant_errors_of(constant_errors)
-    scatter = check_array(local, "local", (2,))
     if reconstruction.history is None:
         raise ValueError(f"reconstruction must have a surface that was followed, got {reconstruction.verdict!r}")
     usual = reconstruction.again(reconstruction.sequence)
+    blurred = np.einsum("nii->ni", local_covariances(reconstruction.sequence, local))
     moved = [
         reconstruction.again(changed_sequence(reconstruction, name, 1 + error))
         for name, error in errors.items()
@@ -95,6 +100,7 @@ def phase_sizes(
         weights = feature.own[near] - background
         if np.count_nonzero(feature.own & near) < _FEWEST or weights.sum() <= 0:
             continue
+        scatter = np.array([blurred[near, :2].mean(), blurred[near, 2].mean()])
         axes = _semi_axes(usual[near], weights, scatter)
         changes = np.array([_semi_axes(part[near], weights, scatter) - axes for part in moved]).reshape(-1, 2)
         blur = (_semi_axes(usual[near], weights, 0 * scatter) - axes) / 2
@@ -120,8 +126,8 @@ def _near(positions: Floats, members: Booleans) -> Booleans:
 
 
 def _semi_axes(cloud, weights, scatter):
-    """Semi-axes across and along the axis without the local scatter [nm], shape (2,)."""
+    """Semi-axes across and along the axis without the variances of the local scatter [nm], shape (2,)."""
     shares = weights / weights.sum()
     variances = np.maximum(shares @ (cloud - shares @ cloud) ** 2, 0.0)
     both = np.array([variances[:2].mean(), variances[2]])
-    return np.sqrt(5 * np.maximum(both - scatter**2, 0.1 * both))
+    return np.sqrt(5 * np.maximum(both - scatter, 0.1 * both))

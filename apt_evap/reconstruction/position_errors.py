@@ -18,11 +18,7 @@ from apt_evap.reconstruction.evolving_surface import IonSequence
 CONSTANT_ERRORS: Mapping[str, float] = {"compression": 0.05, "radius": 0.05, "efficiency": 0.05}
 """Relative standard errors of the constants where none are given."""
 LOCAL_SCATTER = (0.18, 0.06)
-"""Scatter of ions about their neighbours in x and in y, and in depth [nm]: of aluminium, 12 nm, ions at rest."""
-
-MODEL_SCATTER = 0.08
-"""Error of depths by the first order of the equations [nm]: chosen on a layer of 1.15 times the field, for 0.69 of its
-ions within one standard deviation if the constants are exact."""
+"""Scatter of ions along the surface, in each of two directions, and across it [nm]: aluminium, 12 nm, ions at rest."""
 
 _BLOCKS = 50  # of the sequence
 _CLOSE, _NEAR = 4, 24  # neighbours over which corrections of halves, and their squares, are averaged
@@ -42,7 +38,7 @@ def position_covariances(
     constant_errors : mapping, optional
         Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
     local : sequence of float
-        Scatter of the ions about their neighbours along x and y, and in depth [nm], such as `local_scatter` of a
+        Scatter of the ions about their neighbours along the surface and across it [nm], such as `local_scatter` of a
         simulated specimen of the same matrix.
 
     Returns
@@ -58,20 +54,19 @@ def position_covariances(
     Notes
     -----
     The sum of four parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
-    neighbours; the change by one standard error of each constant; the local scatter, which comes from the emission and
-    the lattice and is not seen in any measurement; and `MODEL_SCATTER` in depth.
+    neighbours; the change by one standard error of each constant; what the recession is not sure about, see
+    `EvolvingReconstruction.recession_changes`; and the local scatter, which comes from the emission
+    and the lattice and is not seen in any measurement. An ion whose place on the surface is wrong is moved along it:
+    far from the axis this changes its depth, too.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
     if reconstruction.history is None:
         raise ValueError(f"reconstruction must have a surface that was followed, got {reconstruction.verdict!r}")
     errors = constant_errors_of(constant_errors)
-    across, along = (check_number(value, "local", at_least=0, unit="nm") for value in check_array(local, "local", (2,)))
-    along = math.hypot(along, MODEL_SCATTER)
     ions = reconstruction.sequence
     usual = reconstruction.again(ions)
     sphere = ions.radius * ions.directions - np.array([0, 0, 1]) * ions.depths[1:, None]
-    total = np.zeros((len(usual), 3, 3))
-    total[:, [0, 1, 2], [0, 1, 2]] = across**2, across**2, along**2
+    total = local_covariances(ions, local)
     corrections = []
     for first in (0, 1):
         rows = slice(first, None, 2)
@@ -84,8 +79,13 @@ def position_covariances(
     near = scipy.spatial.cKDTree(sphere).query(sphere, k=_NEAR)[1]
     products = half[:, :, None] * half[:, None, :]
     total += products[near].mean(axis=1)
-    for name, error in errors.items():
-        change = reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual if error else 0 * usual
+    changes = reconstruction.recession_changes()
+    changes += [
+        reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual
+        for name, error in errors.items()
+        if error
+    ]
+    for change in changes:
         change -= change.mean(axis=0)
         total += change[:, :, None] * change[:, None, :]
     total *= np.array([1, 1, -1])[:, None] * np.array([1, 1, -1])  # depth in place of z
@@ -94,6 +94,14 @@ def position_covariances(
     places = reconstruction.positions
     stride = -(-len(places) // len(usual))
     return np.asarray(total[scipy.spatial.cKDTree(places[::stride]).query(places)[1]])
+
+
+def local_covariances(ions: IonSequence, local: Sequence[float]) -> Floats:
+    """Covariance of the scatter along the surface, a sphere, and across it [nm^2], shape (n, 3, 3)."""
+    along, across = (check_number(value, "local", at_least=0, unit="nm") for value in check_array(local, "local", (2,)))
+    normals = ions.directions
+    found: Floats = along**2 * np.eye(3) + (across**2 - along**2) * normals[:, :, None] * normals[:, None, :]
+    return found
 
 
 def local_scatter(reconstruction: EvolvingReconstruction, sites: ArrayLike) -> tuple[float, float]:
@@ -109,15 +117,18 @@ def local_scatter(reconstruction: EvolvingReconstruction, sites: ArrayLike) -> t
     Returns
     -------
     tuple of float
-        Standard deviation along x and y, and in depth [nm], for `position_covariances`.
+        Standard deviation along the surface, in each of two directions, and across it [nm], for `position_covariances`.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
     true = check_array(sites, "sites", (len(reconstruction), 3))
     errors = reconstruction.specimen_positions - true
     # the mean of a block is an error of the recession, which the constants and the halves account for
     blocks = np.array_split(errors, _BLOCKS)
-    squares = np.concatenate([(block - block.mean(axis=0)) ** 2 for block in blocks if len(block)]).mean(axis=0)
-    return float(np.sqrt(squares[:2].mean())), float(np.sqrt(squares[2]))
+    left = np.concatenate([block - block.mean(axis=0) for block in blocks if len(block)])
+    places, angles = reconstruction.geometry.places(reconstruction.hits, reconstruction.radii)
+    across = np.einsum("ni,ni->n", left, np.column_stack([places, np.cos(angles)]))
+    along = ((left**2).sum(axis=1) - across**2) / 2
+    return math.sqrt(max(float(along.mean()), 0.0)), float(np.sqrt((across**2).mean()))
 
 
 def constant_errors_of(given: Mapping[str, float] | None) -> dict[str, float]:

@@ -7,7 +7,8 @@ and with the local composition of solutes, and compares both with the true sites
 wrong side of an interface, evaporation fields, and how often the intervals of the positions hold the truth. Radius and
 compression are those that fit the run of pure aluminium; the efficiency is known. Other rows have a voltage with noise,
 a jump and a restart, or constants that are wrong by 5 %, drawn at random. ``python table.py -i runs -o out`` prints the
-table and writes ``cases.json``, ``table.rst`` (median and range over the cases), and ``sections.png``.
+table and writes ``cases.json``, ``table.rst`` (median and range over the cases), ``seeds.rst`` (the same over the seeds
+of each geometry), and ``sections.png``.
 """
 
 import argparse
@@ -132,8 +133,8 @@ def ways_of(base, emission, regions):
     return ways
 
 
-def compare(path, emission="rest"):
-    """One case by all methods: rows of the table."""
+def compare(path, emission="rest", chosen=None):
+    """One case by all methods, or by some: rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
     base = name.split("-")[0]
     phases, shank, _, apex = runs.case(name)
@@ -146,6 +147,8 @@ def compare(path, emission="rest"):
     rows = {"cap": measured(reconstructed(hits, **growth), sites, phase, regions)}
     rng = np.random.default_rng(sum(map(ord, path.stem)))
     for way, solutes in ways_of(base, emission, regions).items():
+        if chosen and way not in chosen:
+            continue
         hits, sites, phase = detected(path, emission, way)
         how = {"labels": phase} if solutes is None else {"solutes": solutes}
         start = time.process_time()
@@ -207,6 +210,16 @@ def summary(cases):
         ]  # fmt: skip
 
 
+def by_geometry(cases):
+    """Lines of the table of medians and ranges over the seeds of each geometry."""
+    geometries = dict.fromkeys(case["name"].rsplit("_", 1)[0] for case in cases)
+    for geometry in geometries:
+        seeds = [case for case in cases if case["name"].rsplit("_", 1)[0] == geometry]
+        for way, _, *values in summary(seeds):
+            if len(seeds) > 1 and way != "wrong constants":
+                yield [f"{geometry}, {len(seeds)} seeds", way, *values]
+
+
 def draw(paths, output):
     """Sections through true sites, cap and evolving surface, and what the model measured."""
     figure = ae.plot.new_figure((13.0, 3.3 * len(paths)))
@@ -241,6 +254,7 @@ def main():
     parser.add_argument("-i", "--input", type=Path, default=Path("runs"), help="folder of the runs; default: runs")
     parser.add_argument("-o", "--output", type=Path, default=Path(), help="folder of table and picture")
     parser.add_argument("--only", nargs="*", metavar="NAME_SEED", help="cases; default: all, and the picture")
+    parser.add_argument("--ways", nargs="*", metavar="METHOD", help="methods beside the cap; default: all")
     options = parser.parse_args()
     kept = options.output / "cases.json"
     cases = json.loads(kept.read_text()) if options.only and kept.exists() else {}
@@ -249,17 +263,22 @@ def main():
         if options.only and path.stem not in options.only:
             continue
         for emission in ("rest", "metal", "all") if "-rolled" in path.stem else ("rest",):
-            case = compare(path, emission)
+            case = compare(path, emission, options.ways)
             cases[case["name"]] = case
             for row, verdict in lines_of(case):
                 print(" | ".join(row), "|", verdict, flush=True)
             kept.write_text(json.dumps(cases, indent=1, default=float))
-    judged = [case for name, case in cases.items() if name.split(" ")[0] not in CHOSEN_ON and "(" not in name]
+    rest = [case for name, case in cases.items() if "(" not in name]
+    judged = [case for case in rest if case["name"] not in CHOSEN_ON]
     header = ["method", "followed", "lateral [nm]", "depth [nm]", "lateral over cap", "depth over cap",
               "width and thickness", "density", "wrong side", "coverage"]  # fmt: skip
-    table = [".. list-table::\n   :header-rows: 1\n"]
-    table += ["   * - " + "\n     - ".join(row) for row in (header, *summary(judged))]
-    (options.output / "table.rst").write_text("\n".join(table) + "\n")
+    for name, rows in (
+        ("table.rst", [header, *summary(judged)]),
+        ("seeds.rst", [["geometry", "method", *header[2:]], *by_geometry(rest)]),
+    ):
+        table = [".. list-table::\n   :header-rows: 1\n"]
+        table += ["   * - " + "\n     - ".join(row) for row in rows]
+        (options.output / name).write_text("\n".join(table) + "\n")
     if not options.only:
         chosen = [path for path in paths if path.stem.startswith(("sphere_low-r", "layer_high-r", "layer40_high"))]
         draw(chosen, options.output)

@@ -131,7 +131,11 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
     halves = ae.reconstruction.position_covariances(found, exact, local=(0.0, 0.0))
     local = ae.reconstruction.position_covariances(found, exact, local=(0.2, 0.1))
-    np.testing.assert_allclose(local - halves, np.broadcast_to(np.diag([0.04, 0.04, 0.01]), halves.shape), atol=1e-12)
+    # 0.2 nm along the surface and 0.1 nm across it
+    scatter = local - halves
+    assert np.linalg.eigvalsh(scatter) == pytest.approx(np.broadcast_to([0.01, 0.04, 0.04], (4000, 3)), abs=1e-12)
+    normals = even_flux(4000, HALF) * [1, 1, -1]  # of x, y and depth
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", scatter, normals), 0.01 * normals, atol=1e-6)
     # an even flux: the surface is the cap, and the distance from it is the error of the whole, here 0.7 of that told
     away = (found.specimen_positions - found.cap_positions)[:, 0].std()
     assert away < np.sqrt(halves[:, 0, 0].mean()) < 2 * away
@@ -140,8 +144,12 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     spread = found.depths[-1] / np.sqrt(12)
     assert np.sqrt(depth[:, 2, 2].mean()) == pytest.approx(spread * (1 - 1 / 1.1), rel=0.1)
     assert np.linalg.eigvalsh(local).min() > 0
-    across, along = ae.reconstruction.local_scatter(found, found.specimen_positions)
-    assert across == pytest.approx(0.0, abs=1e-12) and along == pytest.approx(0.0, abs=1e-12)
+    assert ae.reconstruction.local_scatter(found, found.specimen_positions) == pytest.approx((0, 0), abs=1e-12)
+    # ions that are moved along a sphere: far from the axis their depths change, their distance from its centre does not
+    normals = even_flux(4000, HALF)
+    moved = np.cross(normals, np.random.default_rng(3).normal(size=(4000, 3)))
+    along, across = ae.reconstruction.local_scatter(found, found.specimen_positions + 0.1 * moved)
+    assert along == pytest.approx(0.1, rel=0.05) and across < 0.02
     with pytest.raises(ValueError, match="constant_errors must be one of"):
         ae.reconstruction.position_covariances(found, {"colour": 0.1})
     with pytest.raises(ValueError, match="must have a surface that was followed, got 'cap: 50 ions"):
@@ -165,6 +173,41 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=bump)[0]).verdict.startswith("cap: the voltage changes by")
     rise = 3000.0 * (1 + 0.3 * np.arange(8000) / 8000)
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
+
+
+def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recession():
+    hits, _ = ions_of(voltage=varying())
+    places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
+    ball = np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 1.5
+    found, plain = evolving(hits, labels=ball.astype(int)), evolving(replace(hits, voltage=None))
+    assert found.verdict == "followed by the flux at the rim: at most 0.00 of it is of a phase"
+    np.testing.assert_array_equal(found.positions, plain.positions)
+    (phase,) = found.phases
+    # the voltage changes by 0.3 % about its mean
+    assert phase.ratio == pytest.approx(1.0, abs=0.03) and 0 < phase.error < 0.03
+    assert np.isfinite(found.history.model_voltage).all() and found.specimen("Al").phases[1:]
+    exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+    more, less = (ae.reconstruction.position_covariances(one, exact) for one in (found, plain))
+    (change,) = found.recession_changes()
+    change = (change - change.mean(axis=0)) * [1, 1, -1]
+    np.testing.assert_allclose(more - less, change[:, :, None] * change[:, None, :], atol=1e-12)
+    assert change[:, 2].std() > 0.001 and plain.recession_changes() == []
+
+
+def test_at_the_rim_the_errors_of_fields_and_voltage_are_those_of_the_recession():
+    hits, labels = ions_of(voltage=varying())
+    found = evolving(hits, labels=labels)
+    by_voltage, by_field = found.recession_changes()
+    usual = found.again(found.sequence)
+    (phase,) = found.phases
+    np.testing.assert_array_equal(by_field, found.again(found.sequence, changes=[phase.error]) - usual)
+    # a voltage that is too high by 1.7 % is that of a sphere that recedes more slowly until it is curved less
+    assert 0.005 < np.abs(by_voltage[:, 2]).mean() < 0.05
+    # what is changed is what is reconstructed, but for one more pass of the fixed point
+    assert np.abs(usual - found.specimen_positions - np.array([0, 0, 13.0])).max() < 0.01
+    # a field of the layer that is higher by 5 % changes what comes with the layer and after it
+    moved = found.again(found.sequence, changes=[0.05]) - usual
+    assert moved[:100, 2] == pytest.approx(0.0, abs=1e-6) and np.abs(moved[1700:, 2]).mean() > 0.005
 
 
 @pytest.mark.slow
