@@ -11,12 +11,12 @@ from apt_evap._common.types import Floats
 from apt_evap.spectra.calibration_anchors import Point, find_anchors
 from apt_evap.spectra.candidate_ions import atomic_ions, ions_between
 from apt_evap.spectra.ion_choice import IonChoice
-from apt_evap.spectra.ion_fit import LIGHT, IonFit
+from apt_evap.spectra.ion_fit import IonFit
 from apt_evap.spectra.ion_names import COMMON, GASES, Abundances, Ion, atoms_of_formula, element_of
 from apt_evap.spectra.ion_profiles import IonProfiles
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import Contents, PeakContents
-from apt_evap.spectra.peak_scale import HIGHEST, LOWEST
+from apt_evap.spectra.peak_scale import HIGHEST, LIGHT, LOWEST
 
 _SHAPE = 0.02  # relative error of a content while ions are chosen: the shape of a peak
 _FINAL_SHAPE = 0.003  # relative error of the number of an ion by the shape of its peaks

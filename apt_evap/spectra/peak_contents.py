@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap.spectra.peak_scale import BINS, HIGHEST, LOWEST, PeakScale, centroid, find_places
+from apt_evap.spectra.peak_scale import BINS, HIGHEST, LIGHT, LOWEST, PeakScale, centroid, find_places
 
 _SHORT, _LONG = 30 * BINS, 110 * BINS  # bins of a peak on both sides of its place; the long tail is at high masses
 _TAILS = (0.0, 1.5, 2.5, 4.5, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
@@ -86,16 +86,17 @@ class PeakContents:
         # strong peaks have tails of their own, or common ones if other peaks are near; the others have their mean
         near = np.array([height[np.abs(place - centre) < 60 * BINS].max() for centre in place])
         strong = seen & (height > 0.03 * near) & (height * BINS * 2.5 > _STRONG)
-        common = (strong & ~_isolated(place, height))[strong]
+        own = (self.scale.light > 1) & (mass < LIGHT)  # of another shape
+        common = (strong & ~own & ~_isolated(place, height))[strong]
         mixture = self._mixture / self._mixture.sum()
         rounds = _ROUNDS if self._start is None else _ROUNDS - 1  # the next fits begin with the shape of the last
         for number in range(rounds):
             last = number == rounds - 1
             iterations = _ITERATIONS if last else _ITERATIONS // 3
             ions, shares, below = self._maximise(place, height, strong, common, mixture, iterations)
-            if strong.any():
-                weights = np.sqrt(ions[strong])
-                mixture = np.maximum((shares[strong] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
+            if (strong & ~own).any():
+                weights = np.sqrt(ions[strong & ~own])
+                mixture = np.maximum((shares[strong & ~own] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
                 mixture /= mixture.sum()
         self._mixture = mixture
         shapes = np.where(strong[:, None], shares, mixture) @ self._bases

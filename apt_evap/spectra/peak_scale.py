@@ -8,6 +8,9 @@ from apt_evap._common.types import Floats
 
 LOWEST, HIGHEST = 0.5, 310.0
 """m/n [Da] of the ions that a spectrum may contain."""
+LIGHT = 3.3
+"""m/n [Da] below which peaks may have a width of their own, and ions lie farther from their places: measured, H+ is
+four times as broad as Si2+, and H2+ lies 1.2 % beside its mass."""
 BINS = 3
 """Bins of a histogram per standard deviation of a peak."""
 _STEP = 1e-4  # of ln m/n, of the histogram in which widths are measured
@@ -18,12 +21,16 @@ _WIDTHS = (1e-4, 5e-3)  # of ln m/n; standard deviations are between these
 _MIRRORED = 0.3  # mean logarithm of the left width over the right one, from which tails are at low masses
 _SHARPER, _BROADER = 0.25, 0.2  # quantile of ln width that is of single isotopes, and how much more these may be
 _NOMINAL = 5e-4  # width without a peak
+_OWN = 1.5  # times the common width, from which light peaks have their own
+_SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
 _APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
 
 
 class PeakScale:
     """Coordinate of m/n in units of the standard deviation of a peak, sigma(ln m) = width m^power.
+
+    Peaks of hydrogen, below `LIGHT`, are broader by a factor where they show it.
 
     Parameters
     ----------
@@ -34,10 +41,12 @@ class PeakScale:
     ----------
     mirrored : bool
         Whether peaks have their tails at low masses, as where ions fly longer than the voltage says.
+    light : float
+        Width of the peaks below `LIGHT`, over that of the others.
     """
 
     def __init__(self, mass: Floats) -> None:
-        self.width, self.power, self.mirrored = _widths(mass)
+        self.width, self.power, self.mirrored, self.light = _widths(mass)
         self._first = float(self._coordinate(LOWEST))
         self.size = int((float(self._coordinate(HIGHEST)) - self._first) * BINS) + 1
         self.centres = self.mass(np.arange(self.size, dtype=float))
@@ -45,9 +54,18 @@ class PeakScale:
 
     def sigma(self, mass: Floats | float) -> Floats:
         """Standard deviation of ln m/n of a peak."""
-        return self.width * np.asarray(mass, float) ** self.power
+        mass = np.asarray(mass, float)
+        return self.width * mass**self.power * np.where(mass < LIGHT, self.light, 1.0)
 
     def _coordinate(self, mass):
+        place = self._common(mass)
+        if self.light > 1:
+            edge = self._common(LIGHT)
+            place = np.where(place < edge, edge + (place - edge) / self.light, place)
+        return place
+
+    def _common(self, mass):
+        """The coordinate if all peaks had the common width."""
         mass = np.asarray(mass, float)
         if abs(self.power) < 1e-9:
             return np.log(mass) / self.width
@@ -60,6 +78,9 @@ class PeakScale:
     def mass(self, bins: Floats) -> Floats:
         """The inverse of `bins` [Da]."""
         place = self._first + (np.asarray(bins, float) + 0.5) / BINS
+        if self.light > 1:
+            edge = self._common(LIGHT)
+            place = np.where(place < edge, edge + (place - edge) * self.light, place)
         if abs(self.power) < 1e-9:
             return np.exp(place * self.width)
         return (-place * self.power * self.width) ** (-1 / self.power)
@@ -81,7 +102,7 @@ def _counted(mass, place, size):
 
 
 def _widths(mass):
-    """Width and power of the standard deviation of ln m/n, and whether peaks are sharper at high masses."""
+    """Width and power of the standard deviation of ln m/n, whether tails are at low masses, and width of light peaks."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 
@@ -99,11 +120,28 @@ def _widths(mass):
     sides = zip(right if mirrored else left, tops, strict=True)
     rows = [(width, edges[top], min(math.sqrt(smooth[top]), 50.0)) for width, top in sides if width]
     if not rows:
-        return _NOMINAL, 0.0, False
+        return _NOMINAL, 0.0, False, 1.0
+    heavy = [row for row in rows if row[1] > math.log(LIGHT)]
+    if len(heavy) > 2:
+        width, power = _common_width(heavy)
+        # the sharper side of light peaks, and the standard error of its logarithm
+        light = [
+            (min(low, high) / (width * math.exp(power * edges[top])), math.sqrt(_STEP / (smooth[top] * (low + high))))
+            for low, high, top in zip(left, right, tops, strict=True)
+            if low * high and edges[top] < math.log(LIGHT)
+        ]
+        own = min(light, key=lambda row: row[1], default=(1.0, 1.0))
+        if math.log(own[0]) > max(math.log(_OWN), _SURE * own[1]):
+            return width, power, mirrored, own[0]
+    return *_common_width(rows), mirrored, 1.0
+
+
+def _common_width(rows):
+    """Width and power from widths, ln m/n and weights of peaks."""
     logs, at, weight = np.array(rows).T
     logs = np.log(logs)
     if len(logs) < 3:
-        return float(np.clip(math.exp(np.median(logs)), *_WIDTHS)), 0.0, mirrored
+        return float(np.clip(math.exp(np.median(logs)), *_WIDTHS)), 0.0
     best = math.inf, 0.0, 0.0
     for power in np.arange(-0.6, 0.01, 0.1):  # sqrt(m) for errors of the time, m^0 for those of the energy
         rest = logs - power * at
@@ -115,7 +153,7 @@ def _widths(mass):
         single = order[rest[order] < sharp + _BROADER]
         middle = _quantile(rest[single], weight[single], 0.5)
         best = min(best, (cost, float(power), float(middle)))
-    return float(np.clip(math.exp(best[2]), *_WIDTHS)), best[1], mirrored
+    return float(np.clip(math.exp(best[2]), *_WIDTHS)), best[1]
 
 
 def _quantile(values, weights, part):
