@@ -22,6 +22,7 @@ _MIRRORED = 0.3  # mean logarithm of the left width over the right one, from whi
 _SHARPER, _BROADER = 0.25, 0.2  # quantile of ln width that is of single isotopes, and how much more these may be
 _NOMINAL = 5e-4  # width without a peak
 _OWN = 1.5  # times the common width, from which light peaks have their own
+_FARTHEST = 500  # steps to the half height of one
 _SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
 _APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
@@ -124,16 +125,23 @@ def _widths(mass):
     heavy = [row for row in rows if row[1] > math.log(LIGHT)]
     if len(heavy) > 2:
         width, power = _common_width(heavy)
-        # the sharper side of light peaks, and the standard error of its logarithm
-        light = [
-            (min(low, high) / (width * math.exp(power * edges[top])), math.sqrt(_STEP / (smooth[top] * (low + high))))
-            for low, high, top in zip(left, right, tops, strict=True)
-            if low * high and edges[top] < math.log(LIGHT)
-        ]
-        own = min(light, key=lambda row: row[1], default=(1.0, 1.0))
-        if math.log(own[0]) > max(math.log(_OWN), _SURE * own[1]):
-            return width, power, mirrored, own[0]
+        if (light := _light_width(counts[: int(np.searchsorted(edges, math.log(LIGHT)))], width, power)) > 1:
+            return width, power, mirrored, light
     return *_common_width(rows), mirrored, 1.0
+
+
+def _light_width(counts, width, power):
+    """Width of the strongest peak below `LIGHT` on its sharper side, over the common one; 1 if it may be the same."""
+    from scipy.ndimage import gaussian_filter1d
+
+    edges = math.log(LOWEST) + _STEP * np.arange(len(counts))
+    blur = width * np.exp(power * edges[np.argmax(counts)]) / _STEP  # the common width, to see broad peaks of few ions
+    smooth = gaussian_filter1d(counts, blur)
+    top = int(np.argmax(smooth * np.exp(0.5 * edges)))  # above a background that is constant in time of flight
+    sides = [_half_width(smooth, counts, top, step, blur, _FARTHEST) for step in (-1, 1)]
+    factor = min(sides) / (blur * _STEP)
+    error = math.sqrt(_STEP / max(smooth[top] * sum(sides), 1e-9))
+    return factor if factor > 1 and math.log(factor) > max(math.log(_OWN), _SURE * error) else 1.0
 
 
 def _common_width(rows):
@@ -162,10 +170,10 @@ def _quantile(values, weights, part):
     return float(values[np.searchsorted(sums, part * sums[-1])])
 
 
-def _half_width(smooth, counts, top, step):
+def _half_width(smooth, counts, top, step, blur=1.5, farthest=150):
     """Standard deviation of ln m/n of one side of a peak, 0 if it has none."""
     half, at = smooth[top] / 2, top
-    last = min(max(top + 150 * step, 0), len(smooth) - 1)
+    last = min(max(top + farthest * step, 0), len(smooth) - 1)
     while at != last and smooth[at] > half:
         at += step
     side = counts[at:top] if step < 0 else counts[top + 1 : at + 1]
@@ -173,7 +181,7 @@ def _half_width(smooth, counts, top, step):
         return 0.0
     within = (smooth[at - step] - half) / max(smooth[at - step] - smooth[at], 1e-9)
     half_width = (abs(top - at) - 1 + within) * _STEP
-    return math.sqrt(max((half_width / math.sqrt(2 * math.log(2))) ** 2 - (1.5 * _STEP) ** 2, (0.8e-4) ** 2))
+    return math.sqrt(max((half_width / math.sqrt(2 * math.log(2))) ** 2 - (blur * _STEP) ** 2, (0.8e-4) ** 2))
 
 
 def find_places(counts: Floats) -> tuple[Floats, Floats]:
