@@ -11,12 +11,12 @@ from apt_evap._common.types import Floats
 from apt_evap.spectra.calibration_anchors import Point, find_anchors
 from apt_evap.spectra.candidate_ions import atomic_ions, ions_between
 from apt_evap.spectra.ion_choice import IonChoice
-from apt_evap.spectra.ion_fit import LIGHT, IonFit
+from apt_evap.spectra.ion_fit import IonFit
 from apt_evap.spectra.ion_names import COMMON, GASES, Abundances, Ion, atoms_of_formula, element_of
 from apt_evap.spectra.ion_profiles import IonProfiles
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import Contents, PeakContents
-from apt_evap.spectra.peak_scale import HIGHEST, LOWEST
+from apt_evap.spectra.peak_scale import HIGHEST, LIGHT, LOWEST
 
 _SHAPE = 0.02  # relative error of a content while ions are chosen: the shape of a peak
 _FINAL_SHAPE = 0.003  # relative error of the number of an ion by the shape of its peaks
@@ -454,10 +454,17 @@ class Explainer:
                     others.append((total, other))
                     explanation.sets.append(([*rest, other], self.amounts(fit, [*rest, other])[0], total - value))
             explanation.others.append([other for _, other in sorted(others)[:3]])
+            if choice.atoms[number].sum() > 1:  # its peaks may be isotopes of the others
+                rest = [other for other in kept if other != number]
+                if (total := choice.fit.solve(rest)[1] + choice.cost(rest)) < value + _ALIKE:
+                    explanation.sets.append((rest, self.amounts(fit, rest)[0], total - value))
         for number, bare in self._in_one_peak(fit, kept):
             rest = [other for other in kept if other != number]
             explanation.sets.append((rest, self.amounts(fit, rest)[0], 0.0))
             explanation.others[kept.index(number)].insert(0, bare)
+        for more, total in self._with_perhaps(choice, kept, amplitudes, perhaps):
+            if total < value + _ALIKE:
+                explanation.sets.append(([*kept, *more], self.amounts(fit, [*kept, *more])[0], total - value))
         for others, more in sets:
             numbers = choice.numbers(others).tolist()
             explanation.sets.append((numbers, self.amounts(fit, numbers)[0], more))
@@ -466,6 +473,20 @@ class Explainer:
             for number, others in zip(kept, explanation.others, strict=True):
                 others += [other for other in more if fit.main[other] == fit.main[number] and other not in others]
         return explanation
+
+    def _with_perhaps(self, choice, kept, amplitudes, perhaps):
+        """Atomic ions of each element that has too few lines to be counted, and chi-squared and costs with them."""
+        banned = choice.banned
+        for name in sorted(perhaps):
+            choice.banned = banned - {name}
+            tried = choice.candidates(kept, amplitudes)
+            more = tried[choice.atoms[tried, choice.elements.index(name)] == choice.atoms[tried].sum(1)].tolist()
+            held = choice.fit.solve([*kept, *more])[0][len(kept) :] >= choice.least
+            more = [number for number, enough in zip(more, held, strict=True) if enough]
+            if more:
+                chi2 = choice.fit.solve([*kept, *more])[1]
+                yield more, chi2 + choice.cost([*kept, *more])
+        choice.banned = banned
 
     def _in_one_peak(self, fit, kept):
         """Hydrides whose lines are in one broad peak with those of the ion without hydrogen, and these ions."""

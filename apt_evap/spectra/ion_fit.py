@@ -9,10 +9,8 @@ from apt_evap._common.types import Booleans, Floats
 from apt_evap.spectra.ion_names import Abundances, Ion
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import CORE, Contents
-from apt_evap.spectra.peak_scale import PeakScale
+from apt_evap.spectra.peak_scale import LIGHT, PeakScale
 
-LIGHT = 3.3
-"""m/n [Da] below which ions may lie farther from their places: measured, H2+ 1.2 %."""
 _LIGHT_ERROR, _LIGHT_WINDOW = 5e-3, 0.015  # relative error of their places, and how far a peak may be
 _SHAPE_ERROR = 0.05  # of a place, in standard deviations of a peak
 _READING_ERROR = 2e-4  # of a place [Da]

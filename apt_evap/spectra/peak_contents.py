@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from apt_evap._common.types import Booleans, Floats
-from apt_evap.spectra.peak_scale import BINS, HIGHEST, LOWEST, PeakScale, centroid, find_places
+from apt_evap.spectra.peak_scale import BINS, HIGHEST, LIGHT, LOWEST, PeakScale, centroid, find_places
 
 _SHORT, _LONG = 30 * BINS, 110 * BINS  # bins of a peak on both sides of its place; the long tail is at high masses
 _TAILS = (0.0, 1.5, 2.5, 4.5, 10.0, 25.0)  # lengths of exponential tails to high masses, in standard deviations
@@ -18,6 +18,7 @@ _LONGEST = 0.014  # of ln m/n at 30 Da: longer tails are not of one peak
 _TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
 _MIXTURE = ((0.4, 0.25, 0.15, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
 _STRONG = 3000  # ions of a peak that has a mixture of tails of its own
+_STRONG_LIGHT = 200  # of a light peak whose width is not that of the others
 _ALONE = 12.0  # standard deviations to the next peaks, for tails of its own
 _SMALL = 0.03  # height over its own of a peak that does not count
 _BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
@@ -85,17 +86,18 @@ class PeakContents:
         height = self._smooth[np.rint(place).astype(int)]
         # strong peaks have tails of their own, or common ones if other peaks are near; the others have their mean
         near = np.array([height[np.abs(place - centre) < 60 * BINS].max() for centre in place])
-        strong = seen & (height > 0.03 * near) & (height * BINS * 2.5 > _STRONG)
-        common = (strong & ~_isolated(place, height))[strong]
+        own = (self.scale.light > 1) & (mass < LIGHT)  # of a shape of their own
+        strong = seen & (height > 0.03 * near) & (height * BINS * 2.5 > np.where(own, _STRONG_LIGHT, _STRONG))
+        common = (strong & ~own & ~_isolated(place, height))[strong]
         mixture = self._mixture / self._mixture.sum()
         rounds = _ROUNDS if self._start is None else _ROUNDS - 1  # the next fits begin with the shape of the last
         for number in range(rounds):
             last = number == rounds - 1
             iterations = _ITERATIONS if last else _ITERATIONS // 3
             ions, shares, below = self._maximise(place, height, strong, common, mixture, iterations)
-            if strong.any():
-                weights = np.sqrt(ions[strong])
-                mixture = np.maximum((shares[strong] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
+            if (strong & ~own).any():
+                weights = np.sqrt(ions[strong & ~own])
+                mixture = np.maximum((shares[strong & ~own] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
                 mixture /= mixture.sum()
         self._mixture = mixture
         shapes = np.where(strong[:, None], shares, mixture) @ self._bases

@@ -1,4 +1,4 @@
-"""Widths of the peaks of a spectrum: those of Gaussian peaks are found."""
+"""Widths of the peaks of a spectrum: those of Gaussian peaks are found, and those of hydrogen."""
 
 import numpy as np
 import pytest
@@ -15,3 +15,26 @@ def test_the_width_of_gaussian_peaks_is_found(rng, width, power):
     # 4,000 ions: 1.1 % a peak by the standard deviation, about twice as much by the half height
     assert scale.sigma(PLACES) == pytest.approx(width * PLACES**power, rel=0.03)
     assert scale.power == pytest.approx(power)
+
+
+def with_hydrogen(rng, width, factor, number=1000):
+    """m/n of common peaks, and of H+ that is broader and has a tail to low masses."""
+    mass = np.repeat(PLACES, 4000)
+    mass = mass * np.exp(width * rng.normal(size=len(mass)))
+    light = 1.008 * np.exp(width * (factor * rng.normal(size=number) - (factor > 1) * rng.exponential(3, number)))
+    return np.concatenate([mass, light, (0.8 + 12 * rng.random(2000)) ** 2])
+
+
+@pytest.mark.parametrize("factor", [3.0, 8.0])
+def test_the_width_of_broader_light_peaks_is_their_own(rng, factor):
+    scale = PeakScale(with_hydrogen(rng, 5e-4, factor))
+    assert scale.light == pytest.approx(factor, rel=0.35)  # its sharper side, of 500 ions and with a part of the tail
+    assert scale.sigma(PLACES) == pytest.approx(np.full(6, 5e-4), rel=0.05)
+    places = np.array([0.7, 1.008, 2.016, 3.29, 3.31, 58.0])
+    assert scale.mass(scale.bins(places)) == pytest.approx(places)
+    assert np.diff(scale.bins(places * 1.00001)) == pytest.approx(np.diff(scale.bins(places)), abs=0.1)
+
+
+def test_light_peaks_that_are_as_broad_as_the_others_have_the_common_width(rng):
+    """Up to 1.45 times as broad in 200 random specimens; from 1.5 times they would have their own."""
+    assert [PeakScale(with_hydrogen(rng, 5e-4, 1.0, number)).light for number in (100, 300, 1000, 10_000)] == [1.0] * 4
