@@ -112,6 +112,13 @@ class Run(RunTable):
             With the history of the whole run. Voltages in real units stay those of the whole run if it has them;
             `at_evaporation_field` of the part averages over the selected ions only. `pulses` and `multiplicity` of hits
             count the selected ions.
+
+        Raises
+        ------
+        ValueError
+            If `rows` is of another kind, or in another order.
+        IndexError
+            If a row does not exist, or a mask has another length than the run.
         """
         return replace(self, **select_rows(self, rows))
 
