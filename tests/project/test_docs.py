@@ -5,6 +5,7 @@ import ast
 import dataclasses
 import enum
 import inspect
+import pkgutil
 import re
 import runpy
 import sys
@@ -236,6 +237,12 @@ def test_methods_of_laws_and_rules_have_the_arguments_of_the_code():
             written.add((name, *(word[-1] for word in words if word and word[-1] != "self")))
     assert len(described) >= 8
     assert described - written == set()
+
+
+def test_tables_of_the_settings_page_have_classes():
+    tables = tomllib.loads((ROOT / "docs" / "settings.toml").read_text())["table"]
+    assert len(tables) > 20
+    assert all(inspect.isclass(pkgutil.resolve_name(f"apt_evap.{table['object']}")) for table in tables)
 
 
 def test_links_lead_somewhere():
