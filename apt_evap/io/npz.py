@@ -88,7 +88,8 @@ def read_map(
         name = choose(f"edges in {axis[0]} ({axis}_mm)", name, [array for array in arrays if array.startswith(axis)])
         length = unit if unit is not None else name.rpartition("_")[2]
         if length not in MM:
-            raise FileError(f"{str(path)!r}: the unit of {name} must be one of {', '.join(MM)}, got {length!r}")
+            got = f"got {unit!r}" if unit is not None else f"name it {name}_mm, or give unit=..."
+            raise FileError(f"{str(path)!r}: the unit of {name} must be one of {', '.join(MM)}, {got}")
         if arrays[name].dtype.kind not in "iuf":
             raise FileError(f"{str(path)!r}: {name} must contain numbers, got {arrays[name].dtype}")
         edges.append(arrays[name] * MM[length])

@@ -51,8 +51,10 @@ def test_names_and_unit_can_be_given(tmp_path):
     map = ae.io.read_map(tmp_path / "map.npz", unit="um", **names)
     assert np.array_equal(map.values[INSIDE], 2.0 * COUNTS[INSIDE])
     assert map.x_edges == pytest.approx(1e-3 * X)
-    with pytest.raises(ae.FileError, match=r"map\.npz.*the unit of u must be one of mm, cm, m, um, got 'u'"):
+    with pytest.raises(ae.FileError, match=r"map\.npz.*the unit of u must be one of mm, cm, m, um, name it u_mm"):
         ae.io.read_map(tmp_path / "map.npz", **names)
+    with pytest.raises(ae.FileError, match=r"the unit of u must be one of mm, cm, m, um, got 'inch'"):
+        ae.io.read_map(tmp_path / "map.npz", unit="inch", **names)
     with pytest.raises(ae.FileError, match=r"must contain an array 'w', it contains n int16\[10, 20\]"):
         ae.io.read_map(tmp_path / "map.npz", unit="mm", **names | {"x_edges": "w"})
 
