@@ -66,7 +66,7 @@ def settings_file(options: argparse.Namespace, name: str) -> str:
                 file.write(source.read_bytes())
             copied.append(target.name)
     copies = f"copied {' and '.join(copied)} to this folder" if copied else f"{stem}.toml is in this folder already"
-    tell(options, f"example {stem}: {copies}")
+    tell(options, f"example {stem}: {copies}; its first lines say which commands show what it is for")
     return f"{stem}.toml"
 
 

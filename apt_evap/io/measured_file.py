@@ -200,7 +200,11 @@ class MeasuredFile:
                 raise ValueError(f"--{_option(name)}: {error}") from error
         if self.selects and len(selection) == 0:
             raise ValueError(f"the options select none of the {len(hits):,} ions of {self.path!r}")
-        if self.peaks is None or (note is not None and not self._knows_masses(hits.columns)):
+        if self.peaks is None:
+            return selection
+        if note is not None and not self._knows_masses(hits.columns):
+            if {"time_of_flight", "voltage"} <= set(hits.columns):
+                note(f"all ions are used: --distance MM, the flight length, gives m/n, and the ions of {self.peaks}")
             return selection
         return self._in_peaks(selection, note)
 

@@ -76,14 +76,14 @@ def test_an_example_is_found_by_its_name(folder, capsys):
     """It is copied with what it reads; a file of this name in the folder wins, and is not replaced."""
     assert main(["sweep", "plan", "sweep"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith("example sweep: copied sweep.toml and ni111.toml to this folder\n")
+    assert out.startswith("example sweep: copied sweep.toml and ni111.toml to this folder; its first lines say ")
     assert Path("sweep.toml").read_bytes() == originals()["sweep.toml"] and Path("sweep/points").is_dir()
     assert main(["sweep", "status", "sweep", "--json"]) == 0  # the folder that the first call has made
     assert json.loads(capsys.readouterr().out)["points"] == 4
     Path("gamma_prime.toml").write_text("mine = 1")
     assert main(["run", "gamma_prime"]) == 2
     told = capsys.readouterr()
-    assert told.out == "example gamma_prime: gamma_prime.toml is in this folder already\n"
+    assert told.out.startswith("example gamma_prime: gamma_prime.toml is in this folder already; its first lines ")
     assert "mine" in told.err and Path("gamma_prime.toml").read_text() == "mine = 1"
     Path("core_shell").write_text("mine = 2")  # a path without suffix
     assert main(["run", "core_shell"]) == 2

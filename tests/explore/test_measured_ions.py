@@ -1,6 +1,7 @@
 """Measured ions of the explorer: default masses, a range that is dragged, a part of the sequence, all as text, too."""
 
 import shlex
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -40,6 +41,15 @@ def test_the_main_element_of_a_spectrum(hits):
     ions = MeasuredIons(hits)
     assert main_element(ions.spectrum()) == "Si"
     assert main_element(ae.spectrum(ae.Hits(mass_to_charge=np.random.default_rng(1).uniform(1, 100, 5000)))) is None
+
+
+def test_times_of_flight_without_a_length_are_said_to_need_one(hits):
+    notes, file = [], MeasuredFile("a.raw", peaks="Cu")
+    bare = replace(hits, mass_to_charge=None)
+    assert len(file.select(bare, notes.append)) == len(hits)
+    assert notes == ["all ions are used: --distance MM, the flight length, gives m/n, and the ions of Cu"]
+    assert len(file.select(replace(bare, voltage=None), notes.append)) == len(hits)
+    assert len(notes) == 1  # without voltages it would not
 
 
 @pytest.mark.parametrize("of_times", [False, True])
