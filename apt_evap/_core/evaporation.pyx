@@ -138,7 +138,7 @@ cdef class Evaporation:
         self.atoms, self.law, self.slot_of = atoms, law, slot_of
 
     def relax(self, *, double tolerance=1e-4, int max_sweeps=200, bint double_precision=False, Index extra=0,
-              double opening_angle=0.0, int n_threads=1, start=None):
+              opening_angle=None, int n_threads=1, start=None):
         """Rebuild the tree and solve the charges of the whole surface at its potential.
 
         Parameters
@@ -196,7 +196,7 @@ cdef class Evaporation:
         normals[np.asarray(slot_of)[start.isolated]] = start.isolated_normals
 
         # charges at the given potential, then the keys of all atoms in the resulting fields
-        lists = InteractionLists(tree, opening_angle or self.opening_angle, n_threads)
+        lists = InteractionLists(tree, self.opening_angle if opening_angle is None else opening_angle, n_threads)
         outcome = self.rule.solve(tree, normals, lists, potential=self.potential, tolerance=tolerance,
                                   max_sweeps=max_sweeps, double_precision=double_precision, n_threads=n_threads)
         self.field_unit = self.rule.field_unit(self.coulomb)
@@ -206,7 +206,7 @@ cdef class Evaporation:
         self.n_partial, self.n_slots_before, self.atoms.opened = 0, tree.n_slots, False
         return outcome
 
-    def relax_disturbed(self, *, double tolerance=1e-4, int max_sweeps=200, double opening_angle=0.0, int n_threads=1):
+    def relax_disturbed(self, *, double tolerance=1e-4, int max_sweeps=200, int n_threads=1):
         """Solve the charges of the atoms near the holes since the last relaxation, in the same tree.
 
         These are the atoms within `update_radius` of a hole. The charges further away are fixed, or follow samples: see
@@ -224,8 +224,7 @@ cdef class Evaporation:
         self.since_relaxation = NOT_RELAXED   # after an interruption below no atom can evaporate
         log_rate_at = partial(self.log_rate_at, n_threads=n_threads)
         factor = self.control.before_relaxation(self.chooser.log_total(), log_rate_at)
-        lists = InteractionLists(self.tree, opening_angle or self.opening_angle, n_threads, self.disturbed,
-                                 self.rule.samples)
+        lists = InteractionLists(self.tree, self.opening_angle, n_threads, self.disturbed, self.rule.samples)
         outcome = self.rule.solve(self.tree, self.normals, lists, potential=self.potential, tolerance=tolerance,
                                   max_sweeps=max_sweeps, n_threads=n_threads)
         self.disturbed[:] = 0

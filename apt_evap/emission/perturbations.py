@@ -235,7 +235,7 @@ class LateralVelocity(_Tangential, _Energetic):
     >>> run = ae.Simulation(ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1)), seed=1).run(100)
     >>> rest, hits = run.hits(ae.Unperturbed()), run.hits(ae.LateralVelocity(0.2))
     >>> print(f"displaced by {np.nanmedian(np.hypot(hits.x - rest.x, hits.y - rest.y)):.1f} mm")
-    displaced by 3.8 mm
+    displaced by 3.7 mm
     """
 
     height: float = number(_HEIGHT, default=0.0, at_least=0, at_most=1.0, unit="nm")

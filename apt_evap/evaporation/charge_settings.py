@@ -56,9 +56,9 @@ class ChargeSettings:
         "The same for the first relaxation, which starts from equal charges.", default=1e-5, above=0, at_most=1
     )
     relaxation_angle: float = number(
-        "Opening angle of the relaxations between events, at least `opening_angle`. Measured: with 0.6, charges "
-        "deviate by 2.2e-4 (RMS) from those of direct sums (tip of R = 12 a), less than the error that accumulates "
-        "between two relaxations.",
+        "Opening angle of the relaxations between events, and of the fields at newly exposed atoms; at least "
+        "`opening_angle`. Measured: with 0.6, charges deviate by 2.2e-4 (RMS) from those of direct sums (tip of "
+        "R = 12 a), less than the error that accumulates between two relaxations.",
         default=0.6,
         at_least=0,
         at_most=1.5,

@@ -179,7 +179,7 @@ class Emitter:
             COULOMB,
             self.settings.patch_radius * distance,
             self.settings.update_radius * distance,
-            self.settings.opening_angle,
+            self.settings.relaxation_angle,
             self.settings.potential_bound,
             (check_seed(seed) + _SEED_STEP) % (1 << 64),
             self._rate_control,
@@ -397,11 +397,7 @@ class Emitter:
         tolerance = check_number(settings.tolerance, "tolerance", above=0, at_most=1)
         if core.whole_is_due or core.n_partial + 1 >= settings.whole_interval or tolerance < _SINGLE:
             return self.relax()
-        outcome = core.relax_disturbed(
-            tolerance=tolerance,
-            opening_angle=settings.relaxation_angle,
-            n_threads=usable_threads(self.n_threads),
-        )
+        outcome = core.relax_disturbed(tolerance=tolerance, n_threads=usable_threads(self.n_threads))
         return self.relax() if core.whole_is_due else self._converged(outcome, tolerance)
 
     def _relax(self, tolerance, angle, start=None):

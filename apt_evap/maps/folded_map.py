@@ -165,7 +165,7 @@ def folded(
     >>> print(first)
     <FoldedMap of 364 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.81>
     >>> print(f"{first.correlation(second):.2f}")
-    0.18
+    0.20
     """
     symmetry = check_choice(symmetry, "symmetry", SYMMETRIES)
     reach = check_number(reach, "reach", at_least=1, at_most=90, unit="degrees")

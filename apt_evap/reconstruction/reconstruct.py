@@ -95,7 +95,7 @@ def reconstruct(
     >>> hits = run.at_evaporation_field(field_factor=3.3).hits(ae.Unperturbed())
     >>> settings = ae.reconstruction.ReconstructionSettings(distance=100.0, element="Ni", detector_radius=80.0)
     >>> ae.reconstruct(hits, settings, projection="compressed", compression=1.13)
-    <Reconstruction: 129 ions, 2.6 x 2.6 x 0.6 nm, cap, compressed, R 2.0 to 2.0 nm (voltage); field_factor 3.3,
+    <Reconstruction: 129 ions, 2.6 x 2.5 x 0.6 nm, cap, compressed, R 2.0 to 2.0 nm (voltage); field_factor 3.3,
     evaporation_field 35, compression 1.13, efficiency 1>
     """
     check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")

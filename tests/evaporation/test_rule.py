@@ -236,7 +236,7 @@ def test_bad_parameters_of_the_constant_potential_are_refused(bad, message):
 
 
 def test_the_tolerance_of_relaxations_is_that_of_the_rule(tip12):
-    for rule, expected in ((None, 3e-3), (ae.Robin(), 3e-3), (ae.ConstantPotential(), 8e-3)):
+    for rule, expected in ((None, 6e-3), (ae.Robin(), 6e-3), (ae.ConstantPotential(), 8e-3)):
         assert ae.evaporation.Emitter(tip12, rule=rule).settings.tolerance == expected
     given = ae.evaporation.ChargeSettings(tolerance=1e-3)
     assert ae.evaporation.Emitter(tip12, rule=ae.ConstantPotential(), settings=given).settings == given

@@ -341,10 +341,10 @@ def test_a_relaxation_changes_the_voltage_only_to_the_second_order(tip12):
     """Between two relaxations the voltage is linear in the logarithm of the rates."""
     control = ae.evaporation.VoltageControl(memory=1000)
     emitter = emitter_of(tip12, ae.Arrhenius(50.0), control=control, seed=2)
-    assert sum(map(len, emitter.advance(350))) == 350
+    assert sum(map(len, emitter.advance(370))) == 370
     before, after = emitter._core.control.voltage_factor * emitter.voltage, emitter.control_voltage
     emitter.relax()
-    assert abs(after / before - 1) > 1e-3  # measured 1.4e-3
+    assert abs(after / before - 1) > 1e-3  # measured 2.2e-3
     # measured 2e-5, of a change of 0.6 of the logarithm; 5e-6 is where the iteration stops
     assert emitter.control_voltage == pytest.approx(after, rel=5e-5)
 

@@ -9,8 +9,8 @@ import apt_evap as ae
 
 @pytest.fixture(scope="package")
 def study(small_tip, made_once):
-    """Study of 1,500 ions with a map of the same run as the measured one; two roll-up fractions."""
-    run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1500]
+    """Study of 1,800 ions with a map of the same run as the measured one; two roll-up fractions."""
+    run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1800]
     measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
     energies = {"means": (0.1, 0.2, 0.3), "relative_spreads": (0.5, 1.0), "rollup_fractions": (0.5, 1.0)}
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))

@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.simulation.config.simulation_file import read_config
 
-FINGERPRINT = "16ccf415bca87587c576f279d69d2d00ef0b06c13ffee01b3558b16724474175"
+FINGERPRINT = "f605bfd82eebaafafc81908b785b4b79594f63e451b7277251617842a30648d3"
 PROGRAM = """
 import warnings
 

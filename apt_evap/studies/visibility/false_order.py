@@ -86,7 +86,7 @@ def false_order(
     >>> run = ae.Simulation(tip, seed=1).run(400, [ae.Unperturbed()], responses=False)
     >>> order = ae.studies.false_order(run, "Al")
     >>> order.ions, order.solutes
-    (208, 63)
+    (209, 63)
     """
     runs = [runs] if isinstance(runs, Run) else list(check_sequence(runs, "runs", "Run"))
     if not runs:

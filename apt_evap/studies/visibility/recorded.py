@@ -50,7 +50,7 @@ def recorded_ions(
     >>> run = ae.Simulation(tip, seed=1).run(300, [ae.Unperturbed()], responses=False)
     >>> from apt_evap.studies.visibility.recorded import recorded_ions
     >>> recorded_ions(run).positions.shape
-    (195, 3)
+    (193, 3)
     """
     instrument = Instrument(field_of_view=160.0) if instrument is None else instrument
     real = run.in_real_units()
