@@ -45,6 +45,11 @@ def execute(options: argparse.Namespace) -> int:
         for name, part in (("clusters", result.fractions()), ("matrix", result.matrix_fractions())):
             listed = ", ".join(f"{element} {100 * x:.2f} ± {100 * s:.2f} %" for element, (x, s) in part.items())
             tell(options, f"{name}: {listed}")
+        atoms = result.atoms.sum(axis=0)
+        listed = ", ".join(
+            f"{name} {100 * x:.2f} %" for name, x in zip(cloud.elements, atoms / atoms.sum(), strict=True)
+        )
+        tell(options, f"all ions after envelope and erosion, too rich, as solutes chose them: {listed}")
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "ions": len(cloud)} | result.to_dict())
     return 0

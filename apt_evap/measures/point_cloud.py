@@ -19,6 +19,7 @@ from apt_evap.measures.clusters import (
     NeighbourDistances,
     SeparationChoice,
     choose_separation,
+    held_out_atoms,
     label_clusters,
     nearest_neighbours,
 )
@@ -460,8 +461,8 @@ class Clusters:
         Number of the cluster of each solute by the separation alone, shape (n,); -1 for others. Numbers of solutes,
         centres and radii are those of the members.
     labels : ndarray of int
-        Number of the cluster of each ion after envelope and erosion, shape (n,); -1 outside. Sizes and compositions are
-        those of these ions.
+        Number of the cluster of each ion after envelope and erosion, shape (n,); -1 outside. Sizes and atoms are those
+        of these ions.
     settings : ClusterSettings
         Settings of the method.
     choice : SeparationChoice or None
@@ -535,26 +536,41 @@ class Clusters:
         columns = [np.bincount(self.labels[inside], part, len(self)) for part in self.cloud.atoms[inside].T]
         return np.column_stack(columns)
 
+    @cached_property
+    def _held_out(self):
+        """As `atoms`, without the solutes that chose the ions."""
+        return held_out_atoms(self.cloud.positions, self.solute, self.members, self.cloud.atoms, self.settings)
+
     @property
     def compositions(self) -> Floats:
-        """Fraction of the atoms of each element in each cluster, shape (k, e)."""
+        """Fraction of the atoms of each element in each cluster, shape (k, e); NaN if no other ion is between solutes.
+
+        `atoms` are too rich in solute: ions join a cluster because they are near solutes. These fractions count one
+        half of the solutes, at random and twice, in the envelope and erosion of the other half: the mean of several
+        such halves.
+        """
         with np.errstate(invalid="ignore"):
-            return self.atoms / self.atoms.sum(axis=1, keepdims=True)
+            return self._held_out / self._held_out.sum(axis=1, keepdims=True)
 
     @property
     def composition_errors(self) -> Floats:
-        """Standard deviation of the fractions by the number of atoms, shape (k, e)."""
-        with np.errstate(invalid="ignore"):
-            return np.sqrt(self.compositions * (1 - self.compositions) / self.atoms.sum(axis=1, keepdims=True))
+        """Standard deviation of the fractions by the number of atoms that count, shape (k, e); NaN without any.
+
+        That of fractions with one more atom of the element and one more of the others: few atoms of one element alone
+        do not have the error 0.
+        """
+        return _errors_of_few(self._held_out)
 
     def fractions(self) -> dict[str, Estimated]:
-        """Fraction of the atoms of each element in all clusters together.
+        """Fraction of the atoms of each element in all clusters together, as `compositions`.
 
         Returns
         -------
         dict of str to Estimated
         """
-        return dict(zip(self.cloud.elements, _fractions(self.atoms.sum(axis=0)), strict=True))
+        atoms = self._held_out.sum(axis=0)
+        pairs = zip(_fractions(atoms), _errors_of_few(atoms[None])[0].tolist(), strict=True)
+        return dict(zip(self.cloud.elements, (Estimated(x, error) for (x, _), error in pairs), strict=True))
 
     def matrix_fractions(self) -> dict[str, Estimated]:
         """Fraction of the atoms of each element outside all clusters.
@@ -592,7 +608,7 @@ class Clusters:
         -------
         dict
         """
-        names = ("sizes", "solutes", "centres", "radii", "at_edge", "compositions", "composition_errors")
+        names = ("sizes", "solutes", "centres", "radii", "at_edge", "atoms", "compositions", "composition_errors")
         result = {name: getattr(self, name) for name in names}
         result |= {"settings": self.settings, "elements": self.cloud.elements, "clusters": len(self)}
         result |= {"clustered_fraction": self.clustered_fraction}
@@ -616,3 +632,11 @@ def _fractions(atoms: Floats) -> list[Estimated]:
     if not total:
         return [Estimated(math.nan, math.nan)] * len(atoms)
     return [Estimated(float(x), math.sqrt(x * (1 - x) / total)) for x in atoms / total]
+
+
+def _errors_of_few(atoms: Floats) -> Floats:
+    """Standard deviations of fractions of numbers of atoms (k, e), by one atom more of the element and of others."""
+    total = atoms.sum(axis=1, keepdims=True)
+    share = (atoms + 1) / (total + 2)
+    with np.errstate(divide="ignore"):
+        return np.where(total > 0, np.sqrt(share * (1 - share) / total), np.nan)
