@@ -132,7 +132,7 @@ def radial_distribution(
     most = check_count(centres, "centres", at_least=1)
     random = np.random.default_rng(check_seed(seed))
     hull = ConvexHull(places)
-    inner = hull.distance(places) <= -reach
+    inner = hull.deeper(places, reach)
     if not second.any() or not (inner & first).any():
         raise ValueError(
             f"about must mark ions deeper than reach = {reach:g} nm in the hull of the ions, and `of` some ion, got "
