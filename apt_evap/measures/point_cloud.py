@@ -283,7 +283,7 @@ class PointCloud:
         options = ClusterSettings(d_max, 10 if n_min is None else n_min, order, envelope, erosion)
         if choice is not None and not choice.found:
             warn(
-                f"there are no more clusters of {solute} than by chance (p = {choice.p_value:.2f}); d_max and n_min "
+                f"there are no more clusters of {_listed(solute)} than by chance (p = {choice.p_value:.2f}); d_max and n_min "
                 "search for them in spite of it",
                 DataWarning,
             )
@@ -433,7 +433,7 @@ class PointCloud:
         """Marked ions, at least one."""
         marked = self.mark(solute)
         if not marked.any():
-            raise ValueError(f"solute must mark at least one ion, got no {solute} in {len(self):,} ions")
+            raise ValueError(f"solute must mark at least one ion, got no {_listed(solute)} in {len(self):,} ions")
         return marked
 
     def _atoms_in(self, solute):
@@ -624,6 +624,11 @@ class Clusters:
             return np.column_stack(
                 [np.bincount(self.members[rows], part[rows], len(self)) / self.solutes for part in values.T]
             )
+
+
+def _listed(solute: str | Sequence[str]) -> str:
+    """Names of solutes in a sentence."""
+    return solute if isinstance(solute, str) else ", ".join(solute)
 
 
 def _fractions(atoms: Floats) -> list[Estimated]:

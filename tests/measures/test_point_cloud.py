@@ -205,6 +205,7 @@ def test_molecules_and_parts_of_a_composition():
     [
         (lambda c: c.clusters("Ag"), "solute must be one of Al, Cu, got 'Ag'"),
         (lambda c: c.select(c.species == 0).clusters("Cu"), "solute must mark at least one ion, got no Cu in"),
+        (lambda c: c.select(c.species == 0).clusters(["Cu"]), "got no Cu in"),
         (lambda c: c.select([0, 1]).clusters("Al"), "at least 10 of the ions"),
         (lambda c: c.select([0, 1]).proxigram("Al", 0.5), "isovalue must be within|no Al in 2 ions"),
         (lambda c: c.proxigram("Cu", 0.999, delocalisation=1.0), "isovalue must be within the fractions of voxels"),
