@@ -283,8 +283,8 @@ class PointCloud:
         options = ClusterSettings(d_max, 10 if n_min is None else n_min, order, envelope, erosion)
         if choice is not None and not choice.found:
             warn(
-                f"there are no more clusters of {_listed(solute)} than by chance (p = {choice.p_value:.2f}); d_max and n_min "
-                "search for them in spite of it",
+                f"there are no more clusters of {_listed(solute)} than by chance (p = {choice.p_value:.2f}); d_max and "
+                "n_min search for them in spite of it",
                 DataWarning,
             )
             none = np.full(len(self), -1)
