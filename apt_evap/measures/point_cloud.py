@@ -158,7 +158,14 @@ class PointCloud:
         Returns
         -------
         PointCloud
+
+        Warns
+        -----
+        DataWarning
+            If a surface of triangles is open: what is beyond its rim may be on either side.
         """
+        if isinstance(where, TriangleMesh) and not where.is_closed:
+            warn(f"where is an open surface, beyond whose rim ions may be on either side: {where!r}", DataWarning)
         if callable(where) or callable(getattr(where, "distance", None)):
             where = contains(check_region(where, "where"), self.positions)
         elif not isinstance(where, slice):

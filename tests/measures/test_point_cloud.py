@@ -76,6 +76,16 @@ def test_selections_by_regions():
     )
 
 
+def test_an_open_surface_is_told():
+    cloud = blurred_ball(2, 5000)
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    inside = (cloud.positions >= 0).all(axis=1) & (cloud.positions.sum(axis=1) <= 1)
+    assert np.array_equal(cloud.select(ae.measures.TriangleMesh(corners, faces)).positions, cloud.positions[inside])
+    with pytest.warns(ae.warnings.DataWarning, match="where is an open surface"):
+        cloud.select(ae.measures.TriangleMesh(corners, faces[1:]))
+
+
 def test_molecules_are_taken_apart():
     cloud = ae.measures.PointCloud(
         np.arange(15.0).reshape(5, 3) ** 1.5,
