@@ -31,6 +31,7 @@ from apt_evap.specimen.regions import check_region, contains
 from apt_evap.warnings import DataWarning, warn
 
 _MOST_STEPS = 100_000
+_HALVED = 1.25  # errors of halves of solutes over those by the atoms that count: in 60 clouds of balls, RMS 1.24
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -561,10 +562,10 @@ class Clusters:
 
     @property
     def composition_errors(self) -> Floats:
-        """Standard deviation of the fractions by the number of atoms that count, shape (k, e); NaN without any.
+        """Standard deviation of the fractions, shape (k, e); NaN without atoms that count.
 
-        That of fractions with one more atom of the element and one more of the others: few atoms of one element alone
-        do not have the error 0.
+        That by the number of these atoms, with one more of the element and one more of the others, as few atoms of one
+        element do not have the error 0; and a quarter more, as halves of the solutes were drawn.
         """
         return _errors_of_few(self._held_out)
 
@@ -647,8 +648,8 @@ def _fractions(atoms: Floats) -> list[Estimated]:
 
 
 def _errors_of_few(atoms: Floats) -> Floats:
-    """Standard deviations of fractions of numbers of atoms (k, e), by one atom more of the element and of others."""
+    """Standard deviations of compositions of clusters, of numbers of atoms (k, e)."""
     total = atoms.sum(axis=1, keepdims=True)
     share = (atoms + 1) / (total + 2)
     with np.errstate(divide="ignore"):
-        return np.where(total > 0, np.sqrt(share * (1 - share) / total), np.nan)
+        return np.where(total > 0, _HALVED * np.sqrt(share * (1 - share) / total), np.nan)

@@ -187,7 +187,7 @@ def test_solutes_that_made_a_cluster_do_not_count_in_its_composition(
         errors.append(error)
     assert np.mean(counted) == pytest.approx(rich, abs=0.06)
     assert np.mean(held) == pytest.approx(bias, abs=3 * np.mean(errors) / np.sqrt(6))
-    assert 0.4 < np.std(np.array(held) / errors) < 1.8  # the error is that of one cloud; 95 % of six: 0.4 to 1.6
+    assert 0.3 < np.std(np.array(held) / errors) < 1.6  # 0.6 to 1.0 in 30 seeds; of six 0.4 to 1.6 times that
 
 
 def test_molecules_and_parts_of_a_composition():
@@ -202,7 +202,7 @@ def test_molecules_and_parts_of_a_composition():
     whole = oxide.clusters("Cu", 2.0, 200, envelope=20.0, erosion=0.0)  # each half counts twice in one of two regions
     every = np.array(list(oxide.fractions().values()))
     np.testing.assert_allclose(whole.compositions[0], every[:, 0])
-    np.testing.assert_allclose(whole.composition_errors[0], every[:, 1], rtol=0.01)  # of 35,000 atoms
+    np.testing.assert_allclose(whole.composition_errors[0], 1.25 * every[:, 1], rtol=0.01)  # of 35,000 atoms
     assert [error for _, error in whole.fractions().values()] == whole.composition_errors[0].tolist()
     pair = ae.measures.PointCloud(np.eye(4, 3), [1, 1, 1, 1], ["Al", "Cu"]).clusters("Cu", 2.0, 2)
     assert 0.1 < pair.fractions()["Cu"].error == pair.composition_errors[0, 1]  # two atoms of copper count, of two
