@@ -44,6 +44,7 @@ _FILLED = 0.8  # diameter of a sphere, in distances of neighbours if all ions we
 _NARROWEST = 165  # px, of a view: two of them stand side by side
 _ASSUMED = ("efficiency", "field_factor", "compression")
 _BINS = 96
+_SURFACE_COLOR = "#2fd6d6"  # of no species, and seen on a dark and on a light page
 _SURFACE = 0.07  # nm, radius of the spheres on an isosurface, 0.2 to 0.3 nm apart: ions are seen between them
 _PLACED = ("shift", "rotation")  # constants that put a reconstruction on the sites and change no distance
 
@@ -239,9 +240,9 @@ class ReconstructionPanel:
         ions = np.flatnonzero(chosen[cloud.species])
         ions, surface = (rows[:: max(1, -(-len(rows) // _MOST))] for rows in (ions, surface))
         if len(ions) + len(surface):
-            white = np.full(len(surface), pixel_color("#ffffff"), np.int32)
+            turquoise = np.full(len(surface), pixel_color(_SURFACE_COLOR), np.int32)
             radii = np.r_[np.full(len(ions), radius), np.full(len(surface), _SURFACE)]
-            colors = np.r_[color_of[cloud.species[ions]], white]
+            colors = np.r_[color_of[cloud.species[ions]], turquoise]
             view.put_spheres(np.concatenate([cloud.positions[ions], surface]), colors, radii)
             view.figure.visible = True
         return words(cloud) + problem

@@ -7,7 +7,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.explore.cloud_controls import CloudControls, words
-from apt_evap.explore.reconstruction_panel import ReconstructionPanel
+from apt_evap.explore.reconstruction_panel import _SURFACE_COLOR, ReconstructionPanel
 from apt_evap.explore.specimen_view import SpecimenView, pixel_color
 
 
@@ -37,12 +37,12 @@ def test_the_isosurface_of_a_ball_and_its_region():
     view = SpecimenView()
     panel = SimpleNamespace(controls=controls, species=SimpleNamespace(active=[1]), _order=[0, 1])
     told = ReconstructionPanel._put_cloud(panel, view, cloud)
-    part, white = cloud.select(controls.region()), view.points.data["color"] == pixel_color("#ffffff")
-    assert told == words(part) and np.count_nonzero(~white) == part.mark("Cu").sum()
-    assert 20 < np.count_nonzero(white) < len(away) / 2  # of the isosurface, in the layer only
-    heights = view.points.data["z"][white] + view.centre[2]
+    part, dots = cloud.select(controls.region()), view.points.data["color"] == pixel_color(_SURFACE_COLOR)
+    assert told == words(part) and np.count_nonzero(~dots) == part.mark("Cu").sum()
+    assert 20 < np.count_nonzero(dots) < len(away) / 2  # of the isosurface, in the layer only
+    heights = view.points.data["z"][dots] + view.centre[2]
     assert np.abs(heights - 4).max() <= 0.7 and np.ptp(heights) > 1.2
-    assert view.points.data["radius"][white].max() < view.points.data["radius"][~white].min()
+    assert view.points.data["radius"][dots].max() < view.points.data["radius"][~dots].min()
     controls.offer(cloud)
     assert controls.centre.value == "2, 3, 4" and controls.element.value == "Cu"  # what was typed stays
     controls.size.value = None
