@@ -35,9 +35,11 @@ def main():
     start = time.process_time()
     cloud, balls = cloud_of(int(sys.argv[1]))
     report("ions", start, f"{len(cloud):,} ions, {cloud.mark('Cu').sum():,} solutes, {balls} balls")
+    clusters = []
     for name, measure in (
         ("clusters, d_max 0.45 nm", lambda: len(cloud.clusters("Cu", 0.45, 20))),
-        ("clusters, d_max chosen", lambda: len(cloud.clusters("Cu"))),
+        ("clusters, d_max chosen", lambda: clusters.append(cloud.clusters("Cu")) or len(clusters[-1])),
+        ("their compositions", lambda: f"{clusters[-1].fractions()['Cu'].value:.3f} of 0.5"),
         ("field, voxels of 0.5 nm", lambda: f"{cloud.field('Cu').fraction.size:,} voxels"),
         ("proxigram, reach 1 nm", lambda: f"{cloud.proxigram('Cu', 0.25, reach=1.0).atoms.sum():,.0f} atoms"),
         ("short-range order, 0.3 nm", lambda: f"{cloud.short_range_order(0.3).parameters[1, 1]:.3f}"),

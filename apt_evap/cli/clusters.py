@@ -1,6 +1,7 @@
 """`apt-evap clusters`: clusters of a solute."""
 
 import argparse
+import math
 
 from apt_evap.cli._clouds import add_cloud, add_end, read_cloud
 from apt_evap.cli._declared_options import add_declared
@@ -43,8 +44,15 @@ def execute(options: argparse.Namespace) -> int:
         value, error = result.number_density()
         tell(options, f"{value:.3g} ± {error:.2g} per nm^3; {int(result.at_edge.sum())} at the edge count by one half")
         for name, part in (("clusters", result.fractions()), ("matrix", result.matrix_fractions())):
-            listed = ", ".join(f"{element} {100 * x:.2f} ± {100 * s:.2f} %" for element, (x, s) in part.items())
-            tell(options, f"{name}: {listed}")
+            listed = ", ".join(
+                f"{element} {100 * x:.2f} ± {100 * s:.2f} %" for element, (x, s) in part.items() if math.isfinite(x)
+            )
+            tell(options, f"{name}: {listed or 'no composition, as no other ion is between their solutes'}")
+        atoms = result.atoms.sum(axis=0)
+        listed = ", ".join(
+            f"{name} {100 * x:.2f} %" for name, x in zip(cloud.elements, atoms / atoms.sum(), strict=True)
+        )
+        tell(options, f"all ions after envelope and erosion, which are near solutes by choice: {listed}")
     tell(options, f"wrote {picture}")
     tell_json(options, {"wrote": str(picture), "file": options.file, "ions": len(cloud)} | result.to_dict())
     return 0

@@ -1,6 +1,7 @@
 """Panel of the reconstruction: ions in the specimen with their species, the truth beside them, the field in time."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from html import escape
 from typing import Any
@@ -23,6 +24,7 @@ from bokeh.palettes import RdBu11, interp_palette
 
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation
+from apt_evap.explore.cloud_controls import CloudControls, words
 from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.search_process import guarded, start_thread
 from apt_evap.explore.specimen_view import SIDES, SpecimenView, pixel_color
@@ -42,6 +44,9 @@ _FILLED = 0.8  # diameter of a sphere, in distances of neighbours if all ions we
 _NARROWEST = 165  # px, of a view: two of them stand side by side
 _ASSUMED = ("efficiency", "field_factor", "compression")
 _BINS = 96
+_SURFACE_COLOR = "#2fd6d6"  # of no species, and seen on a dark and on a light page
+_SURFACE = 0.07  # nm, radius of the spheres on an isosurface, 0.2 to 0.3 nm apart: ions are seen between them
+_PLACED = ("shift", "rotation")  # constants that put a reconstruction on the sites and change no distance
 
 
 class ReconstructionPanel:
@@ -69,6 +74,8 @@ class ReconstructionPanel:
             row(*self.constants.values(), styles={"flex-wrap": "wrap"}),
             self.text,
             row(self.species, self.legend, self.side, styles={"flex-wrap": "wrap"}),
+            self.controls.row,
+            self.controls.text,
             row(self.view.figure, self.truth.figure, sizing_mode="stretch_width", styles={"flex-wrap": "wrap"}),
             column(self.depth, self.field, sizing_mode="stretch_width"),
         ]
@@ -105,6 +112,7 @@ class ReconstructionPanel:
         self.species = CheckboxButtonGroup(labels=[], active=[], visible=False)
         self.legend = Div(text="")
         self.species.on_change("active", lambda attr, old, new: self._put_ions())
+        self.controls = CloudControls(self._put_ions)
         self.side = RadioButtonGroup(labels=[*SIDES], active=None, visible=False)
         self.side.on_change("active", lambda attr, old, new: self._side_changed())
         self.depth = Slider(title="depth of the apex [nm]", start=0.0, end=1.0, step=0.1, value=0.0, visible=False)
@@ -175,6 +183,7 @@ class ReconstructionPanel:
             lines += [f"field of {p.name}: {p.ratio:.3f} ± {p.error:.3f} of the matrix" for p in result.phases]
         if self._explorer.run is not None and len(result) > 2:
             errors = result.errors()
+            self.cloud = replace(cloud, positions=result.fitted_positions(fit=_PLACED))
             lines.append(f"beside the truth: {errors.lateral_rms:.2f} nm lateral, {errors.depth_rms:.2f} nm in depth")
         self.text.text = "<br>".join(map(escape, [*lines, *told]))
         numbers = np.bincount(cloud.species[cloud.species >= 0], minlength=len(cloud.names))
@@ -186,6 +195,7 @@ class ReconstructionPanel:
             for name, color in zip(labels, _COLORS, strict=False)
         )
         self.side.visible = True
+        self.controls.offer(self.cloud)
         self._put_ions()
         history = result.history if isinstance(result, EvolvingReconstruction) else None
         self.depth.visible = self.field.visible = history is not None
@@ -197,27 +207,45 @@ class ReconstructionPanel:
             self._put_field()
 
     def _put_ions(self):
-        """Show the chosen species."""
+        """Show the chosen species in the region, and the isosurface, of the reconstruction and of the true sites."""
         if self.cloud is None or self.result is None:
             return
-        color_of = np.zeros(len(self.cloud.names), np.int32)
-        chosen = np.zeros(len(self.cloud.names) + 1, bool)  # the last one is of ions in no range
+        views = [("reconstructed", self.view, self.cloud)]
+        if self._explorer.run is not None:
+            views.append(("true sites", self.truth, replace(self.cloud, positions=self.result.hits.positions)))
+        told = []
+        for name, view, cloud in views:
+            try:
+                told.append(f"{name}: {self._put_cloud(view, cloud)}")
+            except ValueError as error:
+                told.append(f"{name}: {error}")
+        self.controls.text.text = "<br>".join(map(escape, told)) if self.controls.used else ""
+
+    def _put_cloud(self, view, cloud):
+        """Show a cloud; what is in the region, in words."""
+        size = np.ptp(cloud.positions, axis=0)
+        radius = max(_FILLED / 2 * float(np.cbrt(size.prod() / len(cloud))), 0.05)
+        region = self.controls.region()
+        try:
+            surface, problem = self.controls.surface(cloud), ""
+        except ValueError as error:
+            surface, problem = np.zeros((0, 3)), f"; {error}"
+        if region is not None:
+            cloud, surface = cloud.select(region), surface[region.distance(surface) <= 0]
+        color_of = np.zeros(len(cloud.names), np.int32)
+        chosen = np.zeros(len(cloud.names) + 1, bool)  # the last one is of ions in no range
         for number, species in enumerate(self._order):
             color_of[species] = pixel_color(_COLORS[number])
             chosen[species] = number in self.species.active
-        ions = np.flatnonzero(chosen[self.cloud.species])
-        ions = ions[:: max(1, -(-len(ions) // _MOST))]
-        if not len(ions):
-            return
-        colors = color_of[self.cloud.species[ions]]
-        views = [(self.view, self.cloud.positions)]
-        if self._explorer.run is not None:
-            views.append((self.truth, self.result.hits.positions))
-        for view, positions in views:
-            size = np.ptp(positions, axis=0)
-            radius = _FILLED / 2 * float(np.cbrt(size.prod() / len(positions)))
-            view.put_spheres(positions[ions], colors, max(radius, 0.05))
+        ions = np.flatnonzero(chosen[cloud.species])
+        ions, surface = (rows[:: max(1, -(-len(rows) // _MOST))] for rows in (ions, surface))
+        if len(ions) + len(surface):
+            turquoise = np.full(len(surface), pixel_color(_SURFACE_COLOR), np.int32)
+            radii = np.r_[np.full(len(ions), radius), np.full(len(surface), _SURFACE)]
+            colors = np.r_[color_of[cloud.species[ions]], turquoise]
+            view.put_spheres(np.concatenate([cloud.positions[ions], surface]), colors, radii)
             view.figure.visible = True
+        return words(cloud) + problem
 
     def _put_field(self):
         history = self.result.history if isinstance(self.result, EvolvingReconstruction) else None

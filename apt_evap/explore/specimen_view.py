@@ -28,12 +28,12 @@ const project = (x, y, z) => {
 const {x, y, z, color} = points.data
 if (!x.length || !source.data.image.length) return
 const image = source.data.image[0], n = Math.sqrt(image.length)
-const half = source.data.dw[0] / 2, pixel = 2 * half / n, radius = Math.max(points.data.radius[0] / pixel, 1)
+const half = source.data.dw[0] / 2, pixel = 2 * half / n
 const depth = new Float32Array(n * n).fill(-Infinity)
 image.fill(0)
 for (let k = 0; k < x.length; k++) {
   const [right, up, near] = project(x[k], y[k], z[k])
-  const u = (right + half) / pixel, v = (up + half) / pixel
+  const u = (right + half) / pixel, v = (up + half) / pixel, radius = Math.max(points.data.radius[k] / pixel, 1)
   const fog = 0.7 + 0.3 * (near + half) / (2 * half), c = color[k]
   for (let j = Math.max(0, Math.ceil(v - radius)); j < Math.min(n, v + radius); j++) {
     for (let i = Math.max(0, Math.ceil(u - radius)); i < Math.min(n, u + radius); i++) {
@@ -101,18 +101,18 @@ class SpecimenView:
         steps = np.clip((atoms.values - first) / (last - first), 0, 1) * 255
         self.put_spheres(atoms.positions, _PALETTE[steps.astype(int)], _RADIUS * atoms.diameter)
 
-    def put_spheres(self, positions: Floats, colors: Integers, radius: float) -> None:
-        """Show spheres at positions [nm], shape (n, 3), with colours as of `pixel_color` and one radius [nm]."""
+    def put_spheres(self, positions: Floats, colors: Integers, radius: float | Floats) -> None:
+        """Show spheres at positions [nm], shape (n, 3), with colours as of `pixel_color` and radii [nm]."""
         low, high = positions.min(axis=0), positions.max(axis=0)
         self.centre = (low + high) / 2
         x, y, z = (positions - self.centre).astype(np.float32).T
-        half = float(np.sqrt(x * x + y * y + z * z).max()) + 2 * radius
+        half = float((np.sqrt(x * x + y * y + z * z) + 2 * radius).max())
         self.source.data = {
             "image": [np.zeros((PIXELS, PIXELS), np.uint32)], "x": [-half], "y": [-half],
             "dw": [2 * half], "dh": [2 * half],
         }  # fmt: skip
         self.points.data = {
-            "x": x, "y": y, "z": z, "color": colors, "radius": np.full(len(x), radius, np.float32),
+            "x": x, "y": y, "z": z, "color": colors, "radius": np.full(len(x), radius, dtype=np.float32),
         }  # fmt: skip
         show_extent(self.figure, (-half, half, -half, half))
 

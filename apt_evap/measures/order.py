@@ -132,7 +132,7 @@ def radial_distribution(
     most = check_count(centres, "centres", at_least=1)
     random = np.random.default_rng(check_seed(seed))
     hull = ConvexHull(places)
-    inner = hull.distance(places) <= -reach
+    inner = hull.deeper(places, reach)
     if not second.any() or not (inner & first).any():
         raise ValueError(
             f"about must mark ions deeper than reach = {reach:g} nm in the hull of the ions, and `of` some ion, got "
@@ -179,7 +179,7 @@ def short_range_order(
     Raises
     ------
     ValueError
-        If fewer than two ions have a species, or the shell is empty.
+        If there are fewer than two species, or no neighbours in the shell.
 
     Notes
     -----
@@ -197,14 +197,16 @@ def short_range_order(
     places = check_array(positions, "positions", ("n", 3))
     labels = check_array(species, "species", (len(places),), dtype=np.int64)
     places, labels = places[labels >= 0], labels[labels >= 0]
-    if len(places) < 2:
-        raise ValueError(f"species must be known of at least two ions, got {len(places)}")
     low, high = (0.0, shell) if np.ndim(shell) == 0 else check_array(shell, "shell", (2,)).tolist()  # type: ignore[arg-type]
     check_number(low, "shell", at_least=0, unit="nm")
     high = check_number(high, "shell", above=low, unit="nm")
     trials = check_count(trials, "trials", at_least=2)
+    if len(np.unique(labels)) < 2:
+        raise ValueError(f"species must be at least two of known ions, got {len(np.unique(labels))} of {len(places):,}")
     random = np.random.default_rng(check_seed(seed))
     pairs = neighbour_pairs(places, high, low)
+    if not len(pairs):
+        raise ValueError(f"shell must hold neighbours, got none of {len(places):,} ions from {low:g} to {high:g} nm")
     k = int(labels.max()) + 1
     fractions = np.bincount(labels, minlength=k) / len(labels)
     if k * k <= 256:

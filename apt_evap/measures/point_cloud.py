@@ -19,6 +19,7 @@ from apt_evap.measures.clusters import (
     NeighbourDistances,
     SeparationChoice,
     choose_separation,
+    held_out_atoms,
     label_clusters,
     nearest_neighbours,
 )
@@ -30,6 +31,7 @@ from apt_evap.specimen.regions import check_region, contains
 from apt_evap.warnings import DataWarning, warn
 
 _MOST_STEPS = 100_000
+_HALVED = 1.25  # errors of halves of solutes over those by the atoms that count: in 60 clouds of balls, RMS 1.24
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -157,7 +159,14 @@ class PointCloud:
         Returns
         -------
         PointCloud
+
+        Warns
+        -----
+        DataWarning
+            If a surface of triangles is open: what is beyond its rim may be on either side.
         """
+        if isinstance(where, TriangleMesh) and not where.is_closed:
+            warn(f"where is an open surface, beyond whose rim ions may be on either side: {where!r}", DataWarning)
         if callable(where) or callable(getattr(where, "distance", None)):
             where = contains(check_region(where, "where"), self.positions)
         elif not isinstance(where, slice):
@@ -282,8 +291,8 @@ class PointCloud:
         options = ClusterSettings(d_max, 10 if n_min is None else n_min, order, envelope, erosion)
         if choice is not None and not choice.found:
             warn(
-                f"there are no more clusters of {solute} than by chance (p = {choice.p_value:.2f}); d_max and n_min "
-                "search for them in spite of it",
+                f"there are no more clusters of {_listed(solute)} than by chance (p = {choice.p_value:.2f}); d_max and "
+                "n_min search for them in spite of it",
                 DataWarning,
             )
             none = np.full(len(self), -1)
@@ -432,7 +441,7 @@ class PointCloud:
         """Marked ions, at least one."""
         marked = self.mark(solute)
         if not marked.any():
-            raise ValueError(f"solute must mark at least one ion, got no {solute} in {len(self):,} ions")
+            raise ValueError(f"solute must mark at least one ion, got no {_listed(solute)} in {len(self):,} ions")
         return marked
 
     def _atoms_in(self, solute):
@@ -460,8 +469,8 @@ class Clusters:
         Number of the cluster of each solute by the separation alone, shape (n,); -1 for others. Numbers of solutes,
         centres and radii are those of the members.
     labels : ndarray of int
-        Number of the cluster of each ion after envelope and erosion, shape (n,); -1 outside. Sizes and compositions are
-        those of these ions.
+        Number of the cluster of each ion after envelope and erosion, shape (n,); -1 outside. Sizes and atoms are those
+        of these ions.
     settings : ClusterSettings
         Settings of the method.
     choice : SeparationChoice or None
@@ -535,26 +544,41 @@ class Clusters:
         columns = [np.bincount(self.labels[inside], part, len(self)) for part in self.cloud.atoms[inside].T]
         return np.column_stack(columns)
 
+    @cached_property
+    def _held_out(self):
+        """As `atoms`, without the solutes that chose the ions."""
+        return held_out_atoms(self.cloud.positions, self.solute, self.members, self.cloud.atoms, self.settings)
+
     @property
     def compositions(self) -> Floats:
-        """Fraction of the atoms of each element in each cluster, shape (k, e)."""
+        """Fraction of the atoms of each element in each cluster, shape (k, e); NaN if no other ion is between solutes.
+
+        `atoms` are too rich in solute: ions join a cluster because they are near solutes. These fractions count one
+        half of the solutes, at random and twice, in the envelope and erosion of the other half: the mean of several
+        such halves.
+        """
         with np.errstate(invalid="ignore"):
-            return self.atoms / self.atoms.sum(axis=1, keepdims=True)
+            return self._held_out / self._held_out.sum(axis=1, keepdims=True)
 
     @property
     def composition_errors(self) -> Floats:
-        """Standard deviation of the fractions by the number of atoms, shape (k, e)."""
-        with np.errstate(invalid="ignore"):
-            return np.sqrt(self.compositions * (1 - self.compositions) / self.atoms.sum(axis=1, keepdims=True))
+        """Standard deviation of the fractions, shape (k, e); NaN without atoms that count.
+
+        That by the number of these atoms, with one more of the element and one more of the others, as few atoms of one
+        element do not have the error 0; and a quarter more, as halves of the solutes were drawn.
+        """
+        return _errors_of_few(self._held_out)
 
     def fractions(self) -> dict[str, Estimated]:
-        """Fraction of the atoms of each element in all clusters together.
+        """Fraction of the atoms of each element in all clusters together, as `compositions`.
 
         Returns
         -------
         dict of str to Estimated
         """
-        return dict(zip(self.cloud.elements, _fractions(self.atoms.sum(axis=0)), strict=True))
+        atoms = self._held_out.sum(axis=0)
+        pairs = zip(_fractions(atoms), _errors_of_few(atoms[None])[0].tolist(), strict=True)
+        return dict(zip(self.cloud.elements, (Estimated(x, error) for (x, _), error in pairs), strict=True))
 
     def matrix_fractions(self) -> dict[str, Estimated]:
         """Fraction of the atoms of each element outside all clusters.
@@ -592,7 +616,7 @@ class Clusters:
         -------
         dict
         """
-        names = ("sizes", "solutes", "centres", "radii", "at_edge", "compositions", "composition_errors")
+        names = ("sizes", "solutes", "centres", "radii", "at_edge", "atoms", "compositions", "composition_errors")
         result = {name: getattr(self, name) for name in names}
         result |= {"settings": self.settings, "elements": self.cloud.elements, "clusters": len(self)}
         result |= {"clustered_fraction": self.clustered_fraction}
@@ -610,9 +634,22 @@ class Clusters:
             )
 
 
+def _listed(solute: str | Sequence[str]) -> str:
+    """Names of solutes in a sentence."""
+    return solute if isinstance(solute, str) else ", ".join(solute)
+
+
 def _fractions(atoms: Floats) -> list[Estimated]:
     """Fractions of numbers of atoms, with binomial errors; NaN without atoms."""
     total = float(atoms.sum())
     if not total:
         return [Estimated(math.nan, math.nan)] * len(atoms)
     return [Estimated(float(x), math.sqrt(x * (1 - x) / total)) for x in atoms / total]
+
+
+def _errors_of_few(atoms: Floats) -> Floats:
+    """Standard deviations of compositions of clusters, of numbers of atoms (k, e)."""
+    total = atoms.sum(axis=1, keepdims=True)
+    share = (atoms + 1) / (total + 2)
+    with np.errstate(divide="ignore"):
+        return np.where(total > 0, _HALVED * np.sqrt(share * (1 - share) / total), np.nan)

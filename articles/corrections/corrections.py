@@ -57,9 +57,10 @@ def measure(cloud):
     if not len(clusters):
         return dict.fromkeys(MEASURES, np.nan)
     largest = int(np.argmax(clusters.sizes))
+    atoms = dict(zip(cloud.elements, clusters.atoms[largest], strict=True))
     return {
         "radius": float(clusters.radii[largest]),
-        "Cu": float(clusters.compositions[largest][list(cloud.elements).index("Cu")]),
+        "Cu": float(atoms["Cu"] / sum(atoms.values())),  # of all ions after envelope and erosion
         "clustered": clusters.clustered_fraction,
     }
 

@@ -1,9 +1,9 @@
 """Specimens of the benchmark: what an instrument measures of them, and the truth.
 
-    python benchmarks/ground_truth/generate.py FOLDER [NAME ...] [--secret FILE]
+    python benchmarks/ground_truth/generate.py FOLDER [NAME ...] [--draw K] [--secret FILE]
 
-writes ``measured/NAME.h5`` and ``truth/NAME.h5``. The secret is a text; by default it is read from the
-variable APT_GROUND_TRUTH_SECRET. Without it, the specimens whose seeds are withheld are left out.
+writes ``measured/NAME.h5`` and ``truth/NAME.h5``, of further draws ``NAME_K.h5``. The secret is a text; by default it
+is read from the variable APT_GROUND_TRUTH_SECRET. Without it, the specimens whose seeds are withheld are left out.
 """
 
 import argparse
@@ -24,15 +24,20 @@ import apt_evap as ae
 SETTINGS = tomllib.loads((Path(__file__).parent / "specimens.toml").read_text())
 
 
-def seed_of(name, secret=None):
-    """Seed of a specimen, None if it is withheld and the secret is not known."""
+def seed_of(name, secret=None, draw=0):
+    """Seed of a specimen or of a further draw of it, None if it is withheld and the secret is not known."""
     if "seed" in SETTINGS["specimens"][name]:
-        return SETTINGS["specimens"][name]["seed"]
+        return SETTINGS["specimens"][name]["seed"] + 1000 * draw
     if not secret:
         return None
     if hashlib.sha256(secret.encode()).hexdigest() != SETTINGS["secret_sha256"]:
         print(f"{name}: not the secret of specimens.toml, but another specimen of the same kind", file=sys.stderr)
-    return int.from_bytes(hashlib.sha256(f"{secret}/{name}".encode()).digest()[:8])
+    return int.from_bytes(hashlib.sha256(f"{secret}/{file_of(name, draw)}".encode()).digest()[:8])
+
+
+def file_of(name, draw):
+    """Name of the files of a draw of a specimen."""
+    return f"{name}_{draw}" if draw else name
 
 
 def direction(random):
@@ -171,9 +176,9 @@ def specimen(name, seed, ions=None):
     return run, seen, sites, given, answers
 
 
-def write(folder, name, secret=None, ions=None):
+def write(folder, name, secret=None, ions=None, draw=0):
     """Simulate a specimen and write its two files."""
-    seed = seed_of(name, secret)
+    seed, file_name = seed_of(name, secret, draw), file_of(name, draw)
     if seed is None:
         print(f"{name}: withheld")
         return
@@ -182,31 +187,32 @@ def write(folder, name, secret=None, ions=None):
     run, seen, sites, given, answers = specimen(name, seed, ions)
     for part in ("measured", "truth"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    with h5py.File(folder / "measured" / f"{name}.h5", "w") as file:
+    with h5py.File(folder / "measured" / f"{file_name}.h5", "w") as file:
         for column, values in seen.items():
             file[column] = values
         file.attrs.update(given)
-    with h5py.File(folder / "truth" / f"{name}.h5", "w") as file:
+    with h5py.File(folder / "truth" / f"{file_name}.h5", "w") as file:
         file["positions"] = sites
         file["all_positions"] = run.emissions.positions  # of all atoms that evaporated
         file["all_elements"] = np.array(run.elements).astype("S2")[run.species]
         file.attrs["answers"] = json.dumps(answers)
         file.attrs["withheld"] = "seed" not in SETTINGS["specimens"][name]
     seconds = time.process_time() - start
-    print(f"{name}: {len(sites):,} of {len(run):,} ions, {seconds:.0f} s of processor", flush=True)
+    print(f"{file_name}: {len(sites):,} of {len(run):,} ions, {seconds:.0f} s of processor", flush=True)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", help="specimens; default: all")
+    parser.add_argument("--draw", type=int, default=0, help="number of the draw of each specimen, from 0 on")
     parser.add_argument("--secret", type=Path, help="file with the secret")
     options = parser.parse_args()
     secret = options.secret.read_text().strip() if options.secret else os.environ.get("APT_GROUND_TRUTH_SECRET")
     if unknown := set(options.names) - set(SETTINGS["specimens"]):
         parser.error(f"names must be of {', '.join(SETTINGS['specimens'])}, got {', '.join(sorted(unknown))}")
     for name in options.names or SETTINGS["specimens"]:
-        write(options.folder, name, secret)
+        write(options.folder, name, secret, draw=options.draw)
 
 
 if __name__ == "__main__":

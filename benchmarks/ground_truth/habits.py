@@ -52,8 +52,11 @@ def measures(cloud, given, answers):
                 size = float(clusters.radii.mean()) if len(clusters) else 0.0
                 values["number of clusters", separation] = float(len(clusters)), answers["number"]
                 values["radius of clusters", separation] = size, answers["radius"]
-                share = 100 * np.nan_to_num(clusters.fractions()[solute][0])  # after envelope and erosion by d_max
-                values["solute of clusters", separation] = share, answers[f"{solute} of phase"]
+                true, atoms = answers[f"{solute} of phase"], clusters.atoms.sum(axis=0)
+                every = 100 * atoms[cloud.elements.index(solute)] / max(atoms.sum(), 1)
+                values["solute of all ions after erosion", separation] = every, true  # by d_max, as the envelope
+                held_out = 100 * np.nan_to_num(clusters.fractions()[solute][0])
+                values["solute without those that chose", separation] = held_out, true
             else:
                 values["clusters of a random alloy", separation] = float(len(clusters)), 0.0
     if answers.get("number"):
@@ -95,8 +98,8 @@ def main(folder):
         print(path.stem, {way: len(cloud) for way, cloud in parts.items()}, flush=True)
         for key, (_, true) in table[path.stem]["cap"].items():
             row = [table[path.stem][way][key][0] for way in WAYS]
-            print(f"  {key[0]:30}{key[1]:<6}{true:10.3g}" + "".join(f"{value:10.3g}" for value in row))
-    print(f"RMS of the relative error [%], or mean number of a random alloy:\n{'':46}{WAYS}")
+            print(f"  {key[0]:34}{key[1]:<6}{true:10.3g}" + "".join(f"{value:10.3g}" for value in row))
+    print(f"RMS of the relative error [%], or mean number of a random alloy:\n{'':50}{WAYS}")
     keys = dict.fromkeys(key for ways in table.values() for key in ways["cap"])
     for key in sorted(keys, key=str):
         of = [ways for ways in table.values() if key in ways["cap"]]
@@ -104,7 +107,7 @@ def main(folder):
         for way in WAYS:
             found, true = np.array([ways[way][key] for ways in of]).T
             cells.append(100 * np.sqrt(np.mean((found / true - 1) ** 2)) if true.any() else found.mean())
-        print(f"  {key[0]:30}{key[1]:<6}{len(of):6}" + "".join(f"{cell:10.3g}" for cell in cells))
+        print(f"  {key[0]:34}{key[1]:<6}{len(of):6}" + "".join(f"{cell:10.3g}" for cell in cells))
 
 
 if __name__ == "__main__":

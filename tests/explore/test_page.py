@@ -774,6 +774,23 @@ def test_ions_are_reconstructed_beside_the_truth(run):
     shown = np.sort(panel.truth.points.data["z"]) + panel.truth.centre[2]
     assert shown == pytest.approx(np.sort(expected.hits.positions[:, 2]), abs=1e-4)
     assert not panel.depth.visible and len(panel.view.points.data["x"]) == len(expected)
+    controls, sites = panel.controls, expected.hits.positions
+    placed = expected.fitted_positions(fit=("shift", "rotation"))
+    assert not controls.text.text and controls.element.options == ["none", *panel.cloud.elements]
+    controls.centre.value, controls.size.value, controls.kind.value = "0.5, 0, 2", 1.0, "sphere"
+    inside = [np.count_nonzero(np.linalg.norm(part - (0.5, 0, 2), axis=1) <= 1) for part in (placed, sites)]
+    assert [len(view.points.data["x"]) for view in (panel.view, panel.truth)] == inside and min(inside) > 10
+    assert f"reconstructed: {inside[0]:,} ions" in controls.text.text
+    assert f"true sites: {inside[1]:,} ions" in controls.text.text
+    controls.kind.value = "layer"
+    assert len(panel.truth.points.data["x"]) == np.count_nonzero(np.abs(sites[:, 2] - 2) <= 0.5)
+    controls.centre.value = "here"
+    assert "centre must be three numbers" in controls.text.text
+    controls.kind.value = "all ions"
+    controls.element.value = panel.cloud.elements[0]
+    assert "isovalue must be within the fractions" in controls.text.text  # one element: it is everywhere
+    controls.element.value = "none"
+    assert not controls.text.text
     panel.species.active = []
     page.document.validate()
     panel.shape.value = "evolving"

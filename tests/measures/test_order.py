@@ -89,7 +89,9 @@ def test_a_random_alloy_is_within_its_permutations(cube):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda s: ae.measures.short_range_order(s[:1], [0], 0.3), "must be known of at least two ions, got 1"),
+        (lambda s: ae.measures.short_range_order(s[:1], [0], 0.3), "at least two of known ions, got 1 of 1"),
+        (lambda s: ae.measures.short_range_order(s[:2], [1, 1], 0.3), "at least two of known ions, got 1 of 2"),
+        (lambda s: ae.measures.short_range_order(s[:2], [0, 1], 1e-3), "got none of 2 ions from 0 to 0.001 nm"),
         (
             lambda s: ae.measures.short_range_order(s, np.zeros(len(s), int), (0.3, 0.2)),
             "shell must be",

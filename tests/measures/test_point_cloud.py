@@ -76,6 +76,16 @@ def test_selections_by_regions():
     )
 
 
+def test_an_open_surface_is_told():
+    cloud = blurred_ball(2, 5000)
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    inside = (cloud.positions >= 0).all(axis=1) & (cloud.positions.sum(axis=1) <= 1)
+    assert np.array_equal(cloud.select(ae.measures.TriangleMesh(corners, faces)).positions, cloud.positions[inside])
+    with pytest.warns(ae.warnings.DataWarning, match="where is an open surface"):
+        cloud.select(ae.measures.TriangleMesh(corners, faces[1:]))
+
+
 def test_molecules_are_taken_apart():
     cloud = ae.measures.PointCloud(
         np.arange(15.0).reshape(5, 3) ** 1.5,
@@ -139,10 +149,65 @@ def test_columns_of_clusters():
     assert density.value == pytest.approx(2.5e-3) and density.error == pytest.approx(np.sqrt(2.5) / 1000)
     wide = cloud.clusters("Cu", 0.5, 20, envelope=0.3, erosion=0.0)
     assert wide.sizes[0] > clusters.sizes[0] and np.array_equal(wide.solutes, clusters.solutes)
-    assert wide.fractions()["Cu"].value == pytest.approx(wide.cloud.mark("Cu")[wide.labels >= 0].mean())
+    assert wide.atoms.sum(axis=0)[1] / wide.atoms.sum() == cloud.mark("Cu")[wide.labels >= 0].mean()
     assert wide.atoms.sum() + sum(cloud.select(wide.labels < 0).count_atoms().values()) == len(cloud)
     np.testing.assert_allclose(wide.compositions.sum(axis=1), 1.0)
     assert wide.to_dict()["solutes"] == wide.solutes.tolist()
+
+
+def balls_of(seed, radius, share, matrix, density):
+    """Eight balls with a share of copper in a matrix with another one, in a cube of 9 nm."""
+    rng = np.random.default_rng(seed)
+    places = 9 * rng.random((int(density * 9**3), 3))
+    centres = np.stack(np.meshgrid(*3 * [[2.25, 6.75]]), axis=-1).reshape(-1, 3)
+    inside = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1) < radius
+    copper = rng.random(len(places)) < np.where(inside, share, matrix)
+    return ae.measures.PointCloud(places, copper.astype(int), ["Al", "Cu"])
+
+
+@pytest.mark.parametrize(
+    ("radius", "share", "matrix", "density", "d_max", "n_min", "bias", "rich"),
+    [  # mean differences from the share of 30 other seeds: of these compositions, and of all ions of the clusters
+        (0.8, 0.25, 0.02, 48, 0.5, 12, 0.028, 0.26),
+        (1.0, 0.37, 0.02, 48, 0.5, 18, 0.002, 0.12),
+        (0.8, 0.5, 0.02, 30, 0.5, 10, -0.015, 0.15),
+        (0.0, 0.03, 0.03, 48, 0.55, 6, 0.060, 0.57),  # a random alloy
+    ],
+)
+def test_solutes_that_made_a_cluster_do_not_count_in_its_composition(
+    radius, share, matrix, density, d_max, n_min, bias, rich
+):
+    held, counted, errors = [], [], []
+    for seed in range(6):
+        clusters = balls_of(seed, radius, share, matrix, density).clusters("Cu", d_max, n_min)
+        atoms = clusters.atoms.sum(axis=0)
+        value, error = clusters.fractions()["Cu"]
+        held.append(value - share)
+        counted.append(atoms[1] / atoms.sum() - share)
+        errors.append(error)
+    assert np.mean(counted) == pytest.approx(rich, abs=0.06)
+    assert np.mean(held) == pytest.approx(bias, abs=3 * np.mean(errors) / np.sqrt(6))
+    assert 0.3 < np.std(np.array(held) / errors) < 1.6  # 0.6 to 1.0 in 30 seeds; of six 0.4 to 1.6 times that
+
+
+def test_molecules_and_parts_of_a_composition():
+    cloud = balls_of(1, 1.0, 0.5, 0.01, 48)
+    oxide = ae.measures.PointCloud(cloud.positions, cloud.species, ["Al", "CuO"], [{"Al": 1}, {"Cu": 1, "O": 1}])
+    plain, taken_apart = cloud.clusters("Cu", 0.45, 20), oxide.clusters("Cu", 0.45, 20)
+    share = plain.compositions[:, 1]
+    np.testing.assert_allclose(taken_apart.compositions[:, 1], share / (1 + share))  # two atoms of each solute
+    np.testing.assert_allclose(taken_apart.compositions[:, 1], taken_apart.compositions[:, 2])
+    assert plain.fractions()["Cu"].value == pytest.approx(share.mean(), abs=0.03)
+    assert np.isnan(cloud.clusters("Cu", 0.45, 20, envelope=0.0).compositions).all()  # no ion between solutes
+    whole = oxide.clusters("Cu", 2.0, 200, envelope=20.0, erosion=0.0)  # each half counts twice in one of two regions
+    every = np.array(list(oxide.fractions().values()))
+    np.testing.assert_allclose(whole.compositions[0], every[:, 0])
+    np.testing.assert_allclose(whole.composition_errors[0], 1.25 * every[:, 1], rtol=0.01)  # of 35,000 atoms
+    assert [error for _, error in whole.fractions().values()] == whole.composition_errors[0].tolist()
+    pair = ae.measures.PointCloud(np.eye(4, 3), [1, 1, 1, 1], ["Al", "Cu"]).clusters("Cu", 2.0, 2)
+    assert 0.1 < pair.fractions()["Cu"].error == pair.composition_errors[0, 1]  # two atoms of copper count, of two
+    wide = cloud.clusters("Cu", 0.45, 20, envelope=0.6, erosion=0.0)
+    assert wide.fractions()["Cu"].value < plain.fractions()["Cu"].value - 0.1  # the matrix around counts, too
 
 
 @pytest.mark.parametrize(
@@ -150,6 +215,7 @@ def test_columns_of_clusters():
     [
         (lambda c: c.clusters("Ag"), "solute must be one of Al, Cu, got 'Ag'"),
         (lambda c: c.select(c.species == 0).clusters("Cu"), "solute must mark at least one ion, got no Cu in"),
+        (lambda c: c.select(c.species == 0).clusters(["Cu"]), "got no Cu in"),
         (lambda c: c.select([0, 1]).clusters("Al"), "at least 10 of the ions"),
         (lambda c: c.select([0, 1]).proxigram("Al", 0.5), "isovalue must be within|no Al in 2 ions"),
         (lambda c: c.proxigram("Cu", 0.999, delocalisation=1.0), "isovalue must be within the fractions of voxels"),

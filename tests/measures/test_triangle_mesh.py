@@ -107,6 +107,16 @@ def test_the_convex_hull_of_a_box_is_the_box():
     assert hull.volume == pytest.approx(6.0)
 
 
+@pytest.mark.parametrize("extents", [(9.0, 9.0, 9.0), (30.0, 4.0, 5.0), (20.0, 20.0, 0.01)])
+@pytest.mark.parametrize("depth", [-1.0, 0.0, 0.5, 2.0, 50.0])
+def test_cells_of_points_decide_as_the_points(extents, depth):
+    places = np.random.default_rng(1).random((20_000, 3)) * extents
+    hull = ae.measures.ConvexHull(places[:200])
+    assert np.array_equal(hull.deeper(places, depth), hull.distance(places) <= -depth)
+    assert hull.deeper(places[:1], depth)[0] == (hull.distance(places[:1])[0] <= -depth)
+    assert len(hull.deeper(places[:0], depth)) == 0
+
+
 @pytest.mark.parametrize(
     ("corners", "faces", "message"),
     [

@@ -150,6 +150,19 @@ def test_the_shares_of_a_true_ball_and_its_shell_are_found(shell):
         assert found["Mg of matrix"][0] < 0.5  # those of the shell are not of the matrix: 2.6 % with them
 
 
+def test_draws_of_a_specimen_have_their_own_seeds_and_files(monkeypatch, tmp_path):
+    generate = module("generate")
+    assert [generate.seed_of("nickel", draw=draw) for draw in range(3)] == [102, 1102, 2102]
+    of_iron = [generate.seed_of("iron", "a secret", draw) for draw in range(3)]
+    assert len(set(of_iron)) == 3 and of_iron[0] == generate.seed_of("iron", "a secret")
+    assert generate.seed_of("iron", None, 1) is None  # withheld, too
+    written = []
+    monkeypatch.setattr(generate, "write", lambda folder, name, secret, draw: written.append((name, draw)))
+    monkeypatch.setattr(sys, "argv", ["generate.py", str(tmp_path), "nickel", "--draw", "2"])
+    generate.main()
+    assert written == [("nickel", 2)] and generate.file_of("nickel", 2) == "nickel_2"
+
+
 @pytest.mark.slow
 def test_the_generator_gives_nothing_away_and_withholds(tmp_path, capsys):
     generate = module("generate")
@@ -157,13 +170,13 @@ def test_the_generator_gives_nothing_away_and_withholds(tmp_path, capsys):
     assert "withheld" in capsys.readouterr().out and not list(tmp_path.iterdir())
     assert generate.seed_of("iron", "a secret") != generate.seed_of("iron", "another")
     assert sum("seed" not in kind for kind in generate.SETTINGS["specimens"].values()) == 4
-    generate.write(tmp_path, "layers", ions=12_000)
-    with h5py.File(tmp_path / "measured" / "layers.h5") as file:
+    generate.write(tmp_path, "layers", ions=12_000, draw=1)
+    with h5py.File(tmp_path / "measured" / "layers_1.h5") as file:
         assert set(file) == {"x", "y", "voltage", "element"}
         given = dict(file.attrs)
         assert not {"radius", "axis", "field_factor", "seed"} & set(given)
         asked, n = json.loads(given["questions"]), len(file["x"])
-    answers, sites, withheld = score.read_truth(tmp_path / "truth" / "layers.h5")
+    answers, sites, withheld = score.read_truth(tmp_path / "truth" / "layers_1.h5")
     assert set(answers) == set(asked) and not withheld and len(sites) == n > 1000
     assert 35 < answers["Cu of phase"] < 50 > 3 > answers["Cu of matrix"] > 1
     assert 0.5 <= answers["thickness"] <= 0.7 and 7.0 < answers["apex radius"] < 9.5
