@@ -53,6 +53,7 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"{start.indexing}")
     start.save(path)
     doubt = "" if start.indexing.decided else " NOT DECIDED, settings of the first candidate:"
-    tell(options, f"wrote {path}:{doubt} {start.cost}; simulate with apt-evap run {shlex.quote(path_word(path))}")
+    command = f"apt-evap run {shlex.quote(path_word(path))}"
+    tell(options, f"wrote {path}:{doubt} {start.cost} of one thread; simulate with {command}")
     tell_json(options, {"wrote": str(path), "file": options.file, **start.to_dict()})
     return 0
