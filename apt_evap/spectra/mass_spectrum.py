@@ -164,6 +164,15 @@ class Spectrum:
         return "\n".join([*lines, *str(self.composition).splitlines()[1:]])
 
     @property
+    def main_element(self) -> str | None:
+        """Formula of more than half of the named ions, None without one."""
+        ions: dict[str, float] = {}
+        for ion in self.ions:
+            ions[ion.formula] = ions.get(ion.formula, 0) + ion.ions
+        most = max(ions, key=lambda formula: ions[formula], default=None)
+        return most if most is not None and ions[most] > 0.5 * math.fsum(ions.values()) else None
+
+    @property
     def ranged(self) -> bool:
         """Whether the ions are those of ranges."""
         return isinstance(self._source, _Ranged)
