@@ -535,7 +535,7 @@ def spectrum(
             lacking = ", ".join(missing) if missing else "distance"
             raise ValueError(f"a spectrum needs mass_to_charge, or times of flight with {lacking}, got {hits!r}")
         flight = FlightFit(check_number(distance, "distance", above=0, unit="mm"), time_zero)
-        flight = fitted_flight(hits, flight, formulas)
+        flight = replace(fitted_flight(hits, flight, formulas), nominal=distance)
         hits = replace(hits, mass_to_charge=flight.masses(hits))
     else:
         _warn_of_masses(hits)
