@@ -591,7 +591,7 @@ def test_info_of_measured_ions(measured, capsys):
     text = capsys.readouterr().out
     assert re.search(r"^  voltage \[V\] +3000 to 5000$", text, re.M)
     assert re.search(r"^detector extent \[mm\] +40 x 40$", text, re.M)
-    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions$", text, re.M)
+    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions   pulses$", text, re.M)
 
 
 def test_info_of_what_cannot_be_read(measured, made, capsys):
