@@ -131,7 +131,7 @@ def execute(options: argparse.Namespace) -> int:
     origins = None if options.origins is None else OriginTable.load(options.origins)
     selection = file.select(hits, note)
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
-    figure = None
+    figure, done = None, f"no picture of fewer than {FEWEST} ions"
     if options.picture is not None or len(reconstruction) >= FEWEST:
         if isinstance(reconstruction, EvolvingReconstruction) and reconstruction.history is not None:
             figure = plot.surface_history(reconstruction, ranges)[0].figure
@@ -144,7 +144,7 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, str(one))
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     if figure is not None:
-        save_figure(picture, figure)
+        done = save_figure(picture, figure)
         result["picture"] = str(picture)
     result["settings"] = for_json(reconstruction.settings)
     result["assumed"] = [one._asdict() for one in assumed]
@@ -157,7 +157,7 @@ def execute(options: argparse.Namespace) -> int:
         result["errors"] = errors.to_dict()
         tell(options, f"RMS errors: {errors.lateral_rms:.3f} nm lateral, {errors.depth_rms:.3f} nm in depth")
     tell(options, f"wrote {len(reconstruction):,} ions to {output}")
-    tell(options, f"no picture of fewer than {FEWEST} ions" if figure is None else f"wrote {picture}")
+    tell(options, done)
     tell_json(options, result)
     return 0
 

@@ -72,13 +72,11 @@ def execute(options: argparse.Namespace) -> int:
     if saved is not None:
         write_rrng(saved, result.ranges())
         tell(options, f"wrote {saved}")
-    save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure)
-    tell(options, f"wrote {picture}")
+    tell(options, save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure))
     if pairs is not None:
         correlation = result.hits.correlation()
         tell(options, f"{correlation}")
-        save_figure(pairs, plot.correlation(correlation, result).figure)
-        tell(options, f"wrote {pairs}")
+        tell(options, save_figure(pairs, plot.correlation(correlation, result).figure))
     summary = {"wrote": str(picture), "file": options.file, "ranges": None if saved is None else str(saved)}
     names = ("name", "formula", "charge", "ions", "error", "intervals", "others")
     ions = [{name: getattr(ion, name) for name in names} for ion in result.ions]

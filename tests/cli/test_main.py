@@ -173,13 +173,14 @@ def datasets(path):
 @NO_PICTURES
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
-    assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
+    assert main(["run", "small.toml", "--checkpoint", "0"]) == 0  # with --resume or without, the run goes on
     out = capsys.readouterr().out
     assert "resumed at 25 of 60 ions\n" in out and "60 ions, 35 of them new, in" in out
     assert "wrote small.h5" in out
     before = (folder / "small.h5").stat()
-    assert main(["run", "small.toml", "--resume"]) == 0
-    assert capsys.readouterr().out.endswith("small.h5 is complete: nothing to do\n")
+    assert main(["run", "small.toml"]) == 0
+    told = "small.h5 is complete: nothing to do, overwrite=True (--force) begins again\n"
+    assert capsys.readouterr().out.endswith(told)
     assert main(["run", "small.toml", "--resume", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["wrote"] is None and told["ions"] == 60
@@ -192,9 +193,8 @@ def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert "seed is 1 in the stored run, 2 in the new one" in failed(
         capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet"
     )
-    assert "(--ions) must be >= 60, the number of ions of the run so far, got 50" in failed(
-        capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
-    )
+    fewer = "(--ions) must be >= 60, the number of ions of the run in 'small.h5', got 50: overwrite=True (--force)"
+    assert fewer in failed(capsys, "run", "small.toml", "--ions", "50", "--quiet")
 
 
 @NO_PICTURES
@@ -202,15 +202,15 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     load("small.h5").ended_by("unfinished").save("small.h5.unfinished")
     os.unlink("small.h5")
-    message = failed(capsys, "run", "small.toml", "--quiet")
-    assert "unfinished run of 25 ions" in message and "(--resume) continues it" in message
+    message = failed(capsys, "run", "small.toml", "--seed", "2", "--quiet")
+    assert "'small.h5' cannot be resumed with other settings (seed" in message and "(--force) replaces it" in message
     assert main(["info", "small.h5.unfinished"]) == 0
     told = capsys.readouterr().out
-    assert "unfinished run of 25 ions" in told and "continue with the same command and --resume" in told
+    assert "unfinished run of 25 ions" in told and "the same command goes on" in told
     assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
         capsys, "info", "small.h5"
     )
-    assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
+    assert main(["run", "small.toml", "--quiet", "--ions", "30"]) == 0
     assert len(load("small.h5")) == 30
     os.rename("small.h5", "small.h5.unfinished")
     assert main(["run", "small.toml", "--quiet", "--force", "--ions", "5"]) == 0
@@ -220,27 +220,23 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
 
 @pytest.mark.slow
 @NO_PICTURES
-def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
+def test_a_run_is_replaced_with_force_only_and_so_are_files_of_others(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0
-    assert main(quick[:-1]) == 0
-    assert "replaced small.h5\nwrote small.png\n" in capsys.readouterr().out
     created = (folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns
     assert main(quick) == 0
-    assert created[0] < (folder / "small.h5").stat().st_mtime_ns
-    assert created[1] < (folder / "small.png").stat().st_mtime_ns
-
     with_seed = (
-        "small.h5' contains a run with other settings (seed is 1 in the stored run, 2 in the new one): "
+        "small.h5' cannot be resumed with other settings (seed is 1 in the stored run, 2 in the new one): "
         "overwrite=True (--force) replaces it"
     )
     assert with_seed in failed(capsys, *quick, "--seed", "2")
-    assert "small.h5' contains a run of 5 ions, more than the requested 4: overwrite=True (--force)" in failed(
-        capsys, *quick, "--ions", "4"
-    )
+    assert created == ((folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns)
+    assert main([*quick[:-1], "--force"]) == 0
+    assert "replaced small.h5\nreplaced small.png\n" in capsys.readouterr().out
+    assert created[0] < (folder / "small.h5").stat().st_mtime_ns
+    assert created[1] < (folder / "small.png").stat().st_mtime_ns
     load("small.h5").ended_by("interrupted").save("small.h5")
-    assert "an incomplete run of 5 ions (interrupted): resume=True (--resume)" in (failed(capsys, *quick))
-    assert main([*quick, "--force"]) == 0
+    assert main(quick) == 0  # goes on
 
     (folder / "small.png").write_bytes(b"a photograph")
     assert "'small.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *quick)

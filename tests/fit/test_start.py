@@ -175,9 +175,11 @@ def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
     arguments = ["start", "measured.npz", "--element", "Ni", "--scales", "56,64", "--minutes", "2", "-o", "mine.toml"]
     assert main(arguments) == 0
     assert (tmp_path / "mine.toml").read_text().startswith(MARK)
-    assert main([*arguments, "--quiet"]) == 0  # its own file is replaced
+    assert main([*arguments, "--quiet"]) == 2 and "'mine.toml' exists: --force" in capsys.readouterr().err
     (tmp_path / "mine.toml").write_text("[tip]\n")
     assert main(arguments) == 2 and "mine.toml" in capsys.readouterr().err
+    assert main([*arguments, "--force", "--quiet"]) == 0
+    assert (tmp_path / "mine.toml").read_text().startswith(MARK)
     assert main(["index", "measured.npz", "--element", "Ni", "--pole=-1,x"]) == 2
     assert "--pole" in capsys.readouterr().err
 
