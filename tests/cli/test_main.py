@@ -1,3 +1,4 @@
+import importlib
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from systems import MODES, PIPES, TERMINAL
 
 from apt_evap import __version__, cli, plot
 from apt_evap.cli import _progress
+from apt_evap.cli import main as cli_main
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import EXIT_CODES
 from apt_evap.detection.hits import Hits
@@ -416,6 +418,24 @@ def test_an_interrupted_exec_of_a_library_does_not_change_the_exit_code(tmp_path
         [sys.executable, "-m", "program"], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
     assert ended.returncode == 130 and "apt-evap info a" in ended.stderr
+
+
+def test_a_signal_during_an_import_is_not_lost(tmp_path, monkeypatch, capsys):
+    """As in the beginning of modules of Cython."""
+    (tmp_path / "swallowing.py").write_text(
+        "import signal, time\ntry:\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(0.1)\nexcept:\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def execute(_):
+        importlib.import_module("swallowing")
+        for _ in range(500):
+            time.sleep(0.01)
+        return 0
+
+    monkeypatch.setattr(cli_main, "_execute", execute)
+    assert main(["info", "a"]) == 143 and "swallowing" in sys.modules
+    assert "interrupted, nothing is kept; to start again: apt-evap info a" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
