@@ -166,6 +166,9 @@ def _check_complete(options, settings, hits):
     """Raise one error that names all constants that are missing, each with a value to start from."""
     from apt_evap.reconstruction.assumed_constants import STARTS
 
+    if hits.x is None or hits.y is None:
+        own = "" if hits.positions is None else "; its own positions are what planes, clusters and proxigram take"
+        raise ValueError(f"{options.file!r} has no detector coordinates x and y, which positions follow from{own}")
     missing = [] if "distance" in settings else ["distance"]
     named = bool({"atomic_volume", "element"} & set(settings))
     if not named:
