@@ -129,8 +129,10 @@ def test_all_that_a_file_lacks_is_named_at_once_and_is_enough(measured, tmp_path
     size = " x ".join(f"{length:.1f}" for length in np.ptp(np.float32(positions), axis=0))
     assert f"the positions in 'flat.epos', {size} nm, are not used" in told.err
     assert "assumed efficiency 1 (usual is 0.57 of straight flights" in told.out
-    ae.write("flat.pos", ae.read("flat.epos"))
-    assert main(["reconstruct", "flat.pos"]) == 2  # the file cannot be reconstructed with any constants
+    ae.write("flat.pos", ae.Hits(mass_to_charge=spread, positions=positions))
+    assert (
+        main(["reconstruct", "flat.pos", "-o", "other.pos"]) == 2
+    )  # the file cannot be reconstructed with any constants
     told = capsys.readouterr().err.splitlines()[-1]
     assert "'flat.pos' has no detector coordinates x and y" in told and "its own positions are what planes" in told
     assert main(["reconstruct", "ni.epos", "--element", "Ni", "--distance", "90"]) == 0
