@@ -2,7 +2,7 @@
 
 import pytest
 
-from apt_evap.simulation.config.cost_estimate import estimate_cost
+from apt_evap.simulation.config.cost_estimate import estimate_cost, hours_text
 from apt_evap.simulation.config.simulation_file import read_config
 
 BASE = """
@@ -58,6 +58,10 @@ def test_the_time_of_a_run_is_the_measured_one(tmp_path, material, radius, more,
     # the largest deviations of 24 such runs, in the comment at the constants; the program itself needs 3 s
     assert 0.69 < (times[1] - times[0]) / (1e-3 * per_ion * ions) < 1.37
     assert 0.7 < (2 * times[0] - times[1] - 3.0) / start < 1.65
+
+
+def test_a_time_has_the_unit_that_fits():
+    assert [hours_text(hours) for hours in (2.0, 0.5, 17 / 3600)] == ["2 h", "30 min", "17 s"]
 
 
 def test_every_ion_of_a_run_takes_three_kilobytes(tmp_path):

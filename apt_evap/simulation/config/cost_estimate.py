@@ -54,8 +54,10 @@ class CostEstimate:
 
 
 def hours_text(hours: float) -> str:
-    """Text of a time in hours or minutes, str."""
-    return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
+    """Text of a time in hours, minutes or seconds, str."""
+    if hours >= 1:
+        return f"{hours:.2g} h"
+    return f"{60 * hours:.2g} min" if 60 * hours >= 1 else f"{3600 * hours:.0f} s"
 
 
 def estimate_cost(config: Config, threads: int) -> CostEstimate:
