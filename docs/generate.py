@@ -48,7 +48,7 @@ _THUMBNAILS = {
     "cluster": ("articles/hidden_energies/figure4.png", (0.0, 0.02, 0.66, 0.5)),
     "data_set": ("articles/find_the_precipitate/find_the_precipitate.png", (0.0, 0.48, 0.66, 1.0)),
     "resume": ("docs/soak.png", (0.0, 0.0, 1.0, 1.0)),
-    "from_python": ("docs/ni111.png", (0.5, 0.1, 0.92, 1.0)),
+    "from_python": ("docs/ni111.png", (0.46, 0.137, 0.94, 0.98)),
     "convert_files": ("articles/small_specimens/superalloy.png", (0.0, 0.0, 0.44, 0.5)),
     "atlas": ("articles/find_the_poles/master_patterns.png", (0.22, 0.56, 0.435, 0.98)),
 }

@@ -61,7 +61,10 @@ UNITS = {
 
 
 _OUTCOMES = ("perturbation", "hit", "missed", "never_left", "outside", "not_flown")
-_MEASURED = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions", "pulse_id")
+_MEASURED = (
+    "x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions",
+    "pulses", "multiplicity", "pulse_id",
+)  # fmt: skip
 
 
 def describe(data: Run | Hits | DetectorMap | Tip) -> dict[str, Any]:

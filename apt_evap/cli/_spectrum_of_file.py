@@ -46,6 +46,7 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool
     from dataclasses import replace
 
     from apt_evap.cli._files import file_of, read
+    from apt_evap.detection.detector_map import DetectorMap
     from apt_evap.detection.hits import Hits
     from apt_evap.spectra.mass_spectrum import spectrum
 
@@ -54,7 +55,8 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool
     large = None if pulses else _masses_of_large_file(options)
     hits = read(options) if large is None else large
     if not isinstance(hits, Hits):
-        raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains something else")
+        found = "a map" if isinstance(hits, DetectorMap) else "a run: apt-evap export --real-units makes ions of it"
+        raise ValueError(f"a spectrum needs measured ions, {options.file!r} contains {found}")
     if hits.mass_to_charge is None and hits.time_of_flight is not None and options.distance is None:
         raise ValueError(f"--distance is missing: {options.file!r} has no masses, and times of flight need it [mm]")
     if ranges is not None and options.element is not None:
@@ -69,7 +71,15 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool
     return spectrum(ions, elements, ranges, abundances_of(options.isotope), **flight)
 
 
-def alone_of(options: argparse.Namespace) -> Any:
+def say_losses(options: argparse.Namespace, result: Any) -> None:
+    """Say whether losses by dead time move the composition by more than its error."""
+    from apt_evap.cli._output import say
+
+    if text := result.dead_time_note(_alone_of(options) if result.hits.pulse_id is None else None):
+        say("note", text)
+
+
+def _alone_of(options):
     """Whether each ion of a large file is the only one of its pulse, bool (n,); None if its pulses are not known."""
     import numpy as np
 

@@ -57,7 +57,7 @@ def _content(options):
     summary |= describe(content)
     if isinstance(content, Run) and content.ended == StopReason.UNFINISHED:
         summary["kind"] = f"unfinished run of {len(content):,} ions"
-        summary["ended"] = "not yet: continue with the same command and --resume"
+        summary["ended"] = "not yet: the same command goes on"
     return summary
 
 

@@ -34,7 +34,7 @@ def execute(options: argparse.Namespace) -> int:
     cloud, solute, picture = read_cloud(options, "clusters")
     chosen = {name: getattr(options, name) for name in _SETTINGS if getattr(options, name) is not None}
     result = cloud.clusters(solute, **chosen)
-    save_figure(picture, plot.clusters(result)[0].figure)
+    done = save_figure(picture, plot.clusters(result)[0].figure)
     tell(options, f"{cloud!r}")
     if result.choice is not None:
         separation = f"d_max {result.choice.d_max:.3f} nm, N_min {result.settings.n_min}"
@@ -53,6 +53,6 @@ def execute(options: argparse.Namespace) -> int:
             f"{name} {100 * x:.2f} %" for name, x in zip(cloud.elements, atoms / atoms.sum(), strict=True)
         )
         tell(options, f"all ions after envelope and erosion, which are near solutes by choice: {listed}")
-    tell(options, f"wrote {picture}")
+    tell(options, done)
     tell_json(options, {"wrote": str(picture), "file": options.file, "ions": len(cloud)} | result.to_dict())
     return 0

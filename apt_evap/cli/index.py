@@ -49,8 +49,7 @@ def execute(options: argparse.Namespace) -> int:
         )
     written = {}
     if indexing.candidates:  # of a map that can show no orientation there is no picture
-        save_figure(picture, plot.indexing(indexing)[0].figure)
-        tell(options, f"wrote {picture}")
+        tell(options, save_figure(picture, plot.indexing(indexing)[0].figure))
         written = {"wrote": str(picture)}
     tell_json(options, {**written, "file": options.file, **found})
     return 0

@@ -64,6 +64,7 @@ def _say_warning(message, category, *_, **__):
     say("note" if issubclass(category, WorkflowWarning) else "warning", message)
 
 
+_PAUSE, _LAST = 0.02, 100  # s until a signal during an import comes again, and how often: 2 s, all imports take 1 s
 _KEEPING = ("run", "sweep", "dataset", "twin", "paper")  # commands that go on from what they have done
 
 
@@ -112,10 +113,23 @@ def _drawing_into_files() -> Iterator[None]:
                 os.environ[name] = value
 
 
+def _imports(frame):
+    """Whether a module is being imported, where what the signal raises may be lost.
+
+    Modules of Cython with memory views have an ``except:`` in their beginning, libraries for what they need not have.
+    """
+    while frame is not None:
+        if "importlib._bootstrap" in frame.f_code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
 def _terminated_like_interrupted() -> Iterator[list[int]]:
     """Handle SIGTERM like Ctrl-C; yields a list that contains the signal after its arrival."""
     signals: list[int] = []
+    later: list[threading.Timer] = []
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield signals
         return
@@ -123,12 +137,20 @@ def _terminated_like_interrupted() -> Iterator[list[int]]:
     def interrupt(number: int, frame: Any) -> None:
         signals.append(number)
         handler = signal.getsignal(signal.SIGINT)
+        if handler in (signal.default_int_handler, signal.SIG_IGN, None) and len(signals) < _LAST and _imports(frame):
+            with contextlib.suppress(RuntimeError):  # no thread can be started
+                later[:] = [threading.Timer(_PAUSE, signal.raise_signal, [number])]
+                later[0].daemon = True
+                later[0].start()
+                return
         (handler if callable(handler) else signal.default_int_handler)(signal.SIGINT, frame)
 
     signal.signal(signal.SIGTERM, interrupt)
     try:
         yield signals
     finally:
+        for timer in later:
+            timer.cancel()
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 

@@ -106,7 +106,6 @@ def execute(options: argparse.Namespace) -> int:
     check_output(picture, is_picture, options.force)
     maps, titles, title, crystal = maps_of_file(options)
     colors = {} if options.field_ion is None else {"colormap": "gray", "label": "brightness / mean"}
-    save_picture(picture, maps, titles, title, crystal, width=options.width, **colors)
-    tell(options, f"wrote {picture}")
+    tell(options, save_picture(picture, maps, titles, title, crystal, width=options.width, **colors))
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": map_summaries(maps, titles)})
     return 0

@@ -39,9 +39,9 @@ def execute(options: argparse.Namespace) -> int:
     lengths = {name: getattr(options, name) for name in _LENGTHS if getattr(options, name) is not None}
     profile = cloud.proxigram(solute, options.isovalue, largest=options.largest, **lengths)
     title = f"{', '.join(solute)} at {100 * options.isovalue:g} %, {profile.area:.3g} nm^2"
-    save_figure(picture, plot.composition_profile(profile, title=title).figure)
+    done = save_figure(picture, plot.composition_profile(profile, title=title).figure)
     tell(options, f"{cloud!r}")
     tell(options, f"isosurface of {profile.area:.4g} nm^2")
-    tell(options, f"wrote {picture}")
+    tell(options, done)
     tell_json(options, {"wrote": str(picture), "file": options.file, "ions": len(cloud)} | profile.to_dict())
     return 0

@@ -84,9 +84,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     constants = parser.add_argument_group("constants", "The defaults of a run are its own constants.")
     add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
     constants.add_argument("--element", metavar="NAME", help=f"gives atomic volume and field: {MATERIAL_HELP}")
-    constants.add_argument(
-        "--radius", default="voltage", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage"
-    )
+    constants.add_argument("--radius", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage")
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     add_time_zero(constants)
     parser.add_argument("--peaks", metavar="NAME", help="only the ions in the peaks of this element; default: all ions")
@@ -121,6 +119,9 @@ def execute(options: argparse.Namespace) -> int:
     hits, known, crystal = _ions(options, output)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
+    if (extent := _extent(options, hits)) is not None:
+        size = " x ".join(f"{length:.1f}" for length in extent)
+        note(f"the positions in {options.file!r}, {size} nm, are not used: those that are written follow from its hits")
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
     file = file_of(options)
     if options.species is None:  # ranges are then for the picture and the solutes
@@ -130,7 +131,7 @@ def execute(options: argparse.Namespace) -> int:
     origins = None if options.origins is None else OriginTable.load(options.origins)
     selection = file.select(hits, note)
     reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
-    figure = None
+    figure, done = None, f"no picture of fewer than {FEWEST} ions"
     if options.picture is not None or len(reconstruction) >= FEWEST:
         if isinstance(reconstruction, EvolvingReconstruction) and reconstruction.history is not None:
             figure = plot.surface_history(reconstruction, ranges)[0].figure
@@ -143,7 +144,7 @@ def execute(options: argparse.Namespace) -> int:
         tell(options, str(one))
     result = {"wrote": str(output), "file": options.file, "ions": len(reconstruction)}
     if figure is not None:
-        save_figure(picture, figure)
+        done = save_figure(picture, figure)
         result["picture"] = str(picture)
     result["settings"] = for_json(reconstruction.settings)
     result["assumed"] = [one._asdict() for one in assumed]
@@ -156,7 +157,7 @@ def execute(options: argparse.Namespace) -> int:
         result["errors"] = errors.to_dict()
         tell(options, f"RMS errors: {errors.lateral_rms:.3f} nm lateral, {errors.depth_rms:.3f} nm in depth")
     tell(options, f"wrote {len(reconstruction):,} ions to {output}")
-    tell(options, f"no picture of fewer than {FEWEST} ions" if figure is None else f"wrote {picture}")
+    tell(options, done)
     tell_json(options, result)
     return 0
 
@@ -165,23 +166,69 @@ def _check_complete(options, settings, hits):
     """Raise one error that names all constants that are missing, each with a value to start from."""
     from apt_evap.reconstruction.assumed_constants import STARTS
 
-    if hits.voltage is None and settings["radius"] == "voltage":
-        raise ValueError(
-            f"{options.file!r} has no voltages: --radius shank, or a radius [nm], needs none, got --radius voltage"
-        )
+    if hits.x is None or hits.y is None:
+        own = "" if hits.positions is None else "; its own positions are what planes, clusters and proxigram take"
+        raise ValueError(f"{options.file!r} has no detector coordinates x and y, which positions follow from{own}")
     missing = [] if "distance" in settings else ["distance"]
-    if not {"atomic_volume", "element"} & set(settings):
+    named = bool({"atomic_volume", "element"} & set(settings))
+    if not named:
         missing.append("element")
-    elif settings["radius"] == "voltage" and not {"evaporation_field", "element"} & set(settings):
+    without = settings["radius"] == "voltage" and hits.voltage is None
+    if (
+        settings["radius"] == "voltage"
+        and not without
+        and named
+        and not {"evaporation_field", "element"} & set(settings)
+    ):
         missing.append("evaporation_field")
     if settings["radius"] == "shank":
         missing += [name for name in ("initial_radius", "shank_angle") if name not in settings]
-    if missing:
-        listed = "; ".join(
-            f"--{name.replace('_', '-')} (start with {start}: {source})"
-            for name, (start, source) in ((name, STARTS[name]) for name in missing)
-        )
-        raise ValueError(f"{options.file!r} needs constants that are not in it, got none of {listed}")
+    listed = [(f"--{name.replace('_', '-')}", *STARTS[name]) for name in missing]
+    if without:
+        shank = f"or shank with --initial-radius {STARTS['initial_radius'][0]} --shank-angle {STARTS['shank_angle'][0]}"
+        listed.append(("--radius", "30", f"nm, for it has no voltages; {shank}: from an electron micrograph"))
+    if listed:
+        main = _main_element(hits) if not named else None
+        texts = [f"{name} {main if start == 'NAME' and main else start} ({source})" for name, start, source in listed]
+        raise ValueError(f"{options.file!r} lacks constants, start with {', '.join(texts)}")
+
+
+def _main_element(hits):
+    """The main element of the spectrum of ions, None if it shows none."""
+    from apt_evap.specimen.materials import MATERIALS
+    from apt_evap.spectra.mass_spectrum import spectrum
+
+    try:
+        name = None if hits.mass_to_charge is None else spectrum(hits).main_element
+    except ValueError:
+        return None
+    return name if name in MATERIALS else None
+
+
+def _extent(options, hits):
+    """Lengths of the positions that a measured file has [nm], None without any."""
+    import numpy as np
+
+    from apt_evap.cli._files import blocks_of
+
+    class Extent:
+        def __init__(self):
+            self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+
+        def add(self, ions):
+            finite = ions.positions[np.isfinite(ions.positions).all(axis=1)]
+            self.low = np.minimum(self.low, finite.min(axis=0, initial=np.inf))
+            self.high = np.maximum(self.high, finite.max(axis=0, initial=-np.inf))
+
+    if hits.positions is not None:
+        extent = Extent()
+        extent.add(hits)
+    elif (blocks := blocks_of(options, ("positions",), without=("ranges", "distance"))) is not None:
+        extent = blocks.fed(Extent, "positions")
+    else:
+        return None
+    lengths = extent.high - extent.low
+    return lengths if hits.outcome is None and (lengths > 0).any() and np.isfinite(lengths).all() else None
 
 
 def _surface(options, hits, ranges):
@@ -304,7 +351,7 @@ def _settings(options, known):
     from apt_evap.cli._files import lens_of
 
     chosen = {name: getattr(options, name) for name in _CONSTANTS if getattr(options, name) is not None}
-    chosen["radius"] = _radius(options.radius)
+    chosen["radius"] = _radius("voltage" if options.radius is None else options.radius)
     if options.lens is not None:
         chosen["lens"] = lens_of(options)
     of_run = dict(known)

@@ -12,10 +12,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Run the simulation of a TOML file, save the run and draw its detector maps.\n"
         "Ctrl-C or SIGTERM ends the simulation and saves the ions so far. During the simulation checkpoints are\n"
-        "stored in RUN.h5.unfinished. After a crash --resume continues from there, with the same bits as an\n"
-        "uninterrupted run. The progress bar shows: charges (RMS residual relative to the mean charge); fractions\n"
-        "of the last ions that missed, never left the tip, or are flagged (inexact responses). Without a terminal:\n"
-        "one line per minute. Classes of your own that the file names (module:Class) are imported and executed."
+        "stored in RUN.h5.unfinished. The same command goes on from there, also after a crash, with the same bits\n"
+        "as an uninterrupted run; more --ions make a complete run longer. The progress bar shows: charges (RMS\n"
+        "residual relative to the mean charge); fractions of the last ions that missed, never left the tip, or are\n"
+        "flagged (inexact responses). Without a terminal: one line per minute. Classes of your own that the file\n"
+        "names (module:Class) are imported and executed."
     )
     parser.epilog = (
         "example:\n"
@@ -32,7 +33,9 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=integer_type(1), metavar="N", help="default: all processors")
     parser.add_argument("--seed", type=integer_type(0), metavar="N", help="default: seed in the file")
     parser.add_argument("--map", metavar="MAP.png", help="picture of the maps; default: beside the run")
-    parser.add_argument("--resume", action="store_true", help="continue an unfinished run, or extend a run")
+    parser.add_argument(
+        "--resume", action="store_true", help="continue or extend the run, as without it; not with --force"
+    )
     parser.add_argument(
         "--checkpoint",
         type=number_type("min"),
@@ -42,7 +45,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_speech(parser)
     parser.add_argument(
-        "--force", action="store_true", help="overwrite unfinished and other runs, and files not made by apt-evap"
+        "--force", action="store_true", help="begin again: overwrite a run, and files not made by apt-evap"
     )
 
 
@@ -59,7 +62,7 @@ def execute(options: argparse.Namespace) -> int:
         seed=options.seed,
         picture=options.map,
         threads=options.threads,
-        resume=options.resume,
+        resume=options.resume or not options.force,
         overwrite=options.force,
         checkpoint=options.checkpoint,
         own_classes=True,

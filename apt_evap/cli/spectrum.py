@@ -5,7 +5,7 @@ from pathlib import Path
 
 from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.cli._spectrum_of_file import add_spectrum, spectrum_of
+from apt_evap.cli._spectrum_of_file import add_spectrum, say_losses, spectrum_of
 
 _BIN = 0.05  # of the picture [Da]: narrower ones would be less than a pixel
 
@@ -62,6 +62,7 @@ def execute(options: argparse.Namespace) -> int:
     ranges = None if options.ranges is None else read_ranges(options.ranges)
     result = spectrum_of(options, ranges, pulses=pairs is not None)
     tell(options, f"{result}")
+    say_losses(options, result)
     if result.flight is not None and result.flight.peaks:
         fit = result.flight
         tell(options, f"for other commands: --distance {fit.distance:.2f} --t0 {fit.time_zero:.2f}")
@@ -71,13 +72,11 @@ def execute(options: argparse.Namespace) -> int:
     if saved is not None:
         write_rrng(saved, result.ranges())
         tell(options, f"wrote {saved}")
-    save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure)
-    tell(options, f"wrote {picture}")
+    tell(options, save_figure(picture, plot.spectrum(result, bin_width=_BIN, ranges=ranges).figure))
     if pairs is not None:
         correlation = result.hits.correlation()
         tell(options, f"{correlation}")
-        save_figure(pairs, plot.correlation(correlation, result).figure)
-        tell(options, f"wrote {pairs}")
+        tell(options, save_figure(pairs, plot.correlation(correlation, result).figure))
     summary = {"wrote": str(picture), "file": options.file, "ranges": None if saved is None else str(saved)}
     names = ("name", "formula", "charge", "ions", "error", "intervals", "others")
     ions = [{name: getattr(ion, name) for name in names} for ion in result.ions]

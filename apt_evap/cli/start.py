@@ -24,13 +24,13 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add_reading(parser)
     add_indexing(parser)
     add_specimen(parser)
-    parser.add_argument("--force", action="store_true", help="overwrite a file not made by this command")
+    parser.add_argument("--force", action="store_true", help="overwrite an existing file")
     add_speech(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
-    from apt_evap._common.files import check_path
+    from apt_evap._common.files import FileError, check_path
     from apt_evap._common.threads import thread_count
     from apt_evap.cli._files import lens_of, measured_of
     from apt_evap.cli.index import indexed
@@ -41,6 +41,8 @@ def execute(options: argparse.Namespace) -> int:
 
     path = check_path(options.output or f"{Path(options.file).stem}.toml")
     check_output(path, is_start, options.force)
+    if path.exists() and not options.force:  # its numbers may have been changed
+        raise FileError(f"{str(path)!r} exists: --force overwrites it")
     measured = measured_of(options)
     start = settings_of(
         indexed(measured, options),
@@ -53,6 +55,7 @@ def execute(options: argparse.Namespace) -> int:
     tell(options, f"{start.indexing}")
     start.save(path)
     doubt = "" if start.indexing.decided else " NOT DECIDED, settings of the first candidate:"
-    tell(options, f"wrote {path}:{doubt} {start.cost}; simulate with apt-evap run {shlex.quote(path_word(path))}")
+    command = f"apt-evap run {shlex.quote(path_word(path))}"
+    tell(options, f"wrote {path}:{doubt} {start.cost} of one thread; simulate with {command}")
     tell_json(options, {"wrote": str(path), "file": options.file, **start.to_dict()})
     return 0

@@ -1,6 +1,5 @@
 """Measured ions of a file, and the part of them that the maps show, by their masses and their place in the sequence."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -129,14 +128,3 @@ class MeasuredIons:
     def _computes(self):
         """Whether masses follow from the times of flight."""
         return self.all.mass_to_charge is None and self.distance is not None and not self.lacks_times
-
-
-def main_element(named: Spectrum) -> str | None:
-    """Element of more than half of the named ions of a spectrum, None without one."""
-    ions: dict[str, float] = {}
-    for ion in named.ions:
-        ions[ion.formula] = ions.get(ion.formula, 0) + ion.ions
-    if not ions:
-        return None
-    most = max(ions, key=lambda formula: ions[formula])
-    return most if ions[most] > 0.5 * math.fsum(ions.values()) else None

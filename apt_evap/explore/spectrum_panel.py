@@ -24,7 +24,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
+from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
 from apt_evap.explore.search_process import start_thread
 from apt_evap.explore.start_page import ranges_near
 from apt_evap.explore.widgets import LEFT
@@ -181,7 +181,7 @@ class SpectrumPanel:
         formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
         if self._ions.ranges is not None:
             formulas = list(read_ranges(self._ions.ranges).species_names)
-        main = main_element(named)
+        main = named.main_element
         chosen = self._ions.selection
         options = [_ALL, *(f"ions of {formula}" for formula in formulas)]
         if chosen.element is not None and f"ions of {chosen.element}" not in options:

@@ -35,7 +35,8 @@ DRAWN = 10
 FEWEST, MOST = 4, 16
 # s of one processor for a launch, and for a map beside its launches. Measured (AMD EPYC) with tungsten, 10,120 and
 # 33,008 ions, 16 draws: 30 and 91 s for 305 maps; folded maps of nickel, 10,192 ions, 8 draws: 27 s; aluminium, 16
-# draws: 10 s for 61 maps
+# draws: 10 s for 61 maps. Later, on a busy machine, the estimate of nickel (305 maps, 8 draws) was 24 s for 28 s with
+# 13,384 ions, and 13.7 s for 13.0 s with 5,000
 _PER_LAUNCH, _PER_MAP = 0.5e-6, 25e-3
 
 

@@ -72,8 +72,8 @@ class DensityGains:
         }[self.level]
         others = "no other crystal was tried" if np.isnan(self.over_others) else f"{self.over_others:+.1f} over others"
         return (
-            f"{sentence} (gains in errors: {self.over_lines:+.1f} over lines, {self.over_turned:+.1f} over the turned "
-            f"pattern, {others}; {EXCEEDS:g} are needed)"
+            f"{sentence} (gains in standard errors: {self.over_lines:+.1f} over lines, {self.over_turned:+.1f} over "
+            f"the turned pattern, {others}; each must be above {EXCEEDS:g})"
         )
 
 

@@ -14,8 +14,8 @@ from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruc
 
 STARTS: Mapping[str, tuple[str, str]] = {
     "distance": ("90", "mm, of straight flights behind a local electrode; 382 with a reflectron: its data sheet"),
-    "element": ("the main element", "or the atomic volume [nm^3] of the compound: its density"),
-    "evaporation_field": ("that of the main element", "V/nm, from tables such as `apt_evap.materials()`"),
+    "element": ("NAME", "the main element; or --atomic-volume [nm^3] of a compound: its density"),
+    "evaporation_field": ("VALUE", "that of the main element [V/nm], from tables such as `apt_evap.materials()`"),
     "field_factor": ("3.3", "of the literature, 2 to 5; from the width of lattice planes at a pole"),
     "compression": ("1.5", "of the literature, 1.3 to 1.8; from the angles between poles"),
     "efficiency": ("0.57", "of straight flights, 0.37 to 0.52 with a reflectron, 0.8 of the newest: its data sheet"),
@@ -46,9 +46,10 @@ class Assumption(NamedTuple):
         def pair(changes):
             return " and ".join("none" if math.isnan(change) else f"{change:+.0%}" for change in changes)
 
-        _, source = STARTS[self.name]
+        start, source = STARTS[self.name]
+        usual = source if float(start) == self.value else f"usual is {start} {source}"
         return (
-            f"assumed {self.name.replace('_', ' ')} {self.value:g} ({source}): 10 % less and more change the width by "
+            f"assumed {self.name.replace('_', ' ')} {self.value:g} ({usual}): 10 % less and more change the width by "
             f"{pair(self.width)}, the depth by {pair(self.depth)}, the density by {pair(self.density)}"
         )
 
@@ -81,8 +82,8 @@ def assumptions(reconstruction: Reconstruction, names: Sequence[str]) -> list[As
     >>> ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth))
     >>> result = ae.reconstruct(ions, atomic_volume=0.0166, distance=90.0, radius=30.0)
     >>> print(ae.reconstruction.assumptions(result, ["efficiency"])[0])
-    assumed efficiency 1 (of straight flights, 0.37 to 0.52 with a reflectron, 0.8 of the newest: its data sheet): 10 %
-    less and more change the width by +0% and +0%, the depth by +11% and -9%, the density by -10% and +10%
+    assumed efficiency 1 (usual is 0.57 of straight flights, 0.37 to 0.52 with a reflectron, 0.8 of the newest: its data
+    sheet): 10 % less and more change the width by +0% and +0%, the depth by +11% and -9%, the density by -10% and +10%
     """
     settings, known = reconstruction.settings, reconstruction.geometry
     stride = -(-len(reconstruction) // _IONS)

@@ -24,6 +24,7 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
     -------
     dict
         * ``distance``: that of the detector [mm];
+        * ``efficiency``: 1, every ion that reaches the detector is in a run;
         * ``detector_radius``: of the circle inside the square detector, or of the image of the lens [mm];
         * ``atomic_volume`` [nm^3] and ``evaporation_field``: of the first species. Without the former for a specimen
           from positions, whose volume is not known;
@@ -46,6 +47,7 @@ def run_constants(run: Run, evaporation_field: float | None = None) -> dict[str,
     voltages = run.instrument_voltages
     constants: dict[str, Any] = {
         "distance": run.detector.distance,
+        "efficiency": 1.0,
         "detector_radius": run.detector.width / 2,
         "evaporation_field": field,
         "field_factor": float(np.median(voltages / (field * _radii(run)))),

@@ -157,17 +157,19 @@ class CheckpointWriter:
     def _resume(self, n_ions):
         """Load the run to continue."""
         name, is_unfinished = self._name, self._checkpoint.unfinished.exists()
+        replaces = "overwrite=True (--force) replaces it"
         run = load(self._checkpoint.unfinished if is_unfinished else self._checkpoint.path).simulated()
         if differences := self._differences(run):
-            raise FileError(f"the run in {name!r} cannot be resumed with other settings: {differences}")
+            raise FileError(f"the run in {name!r} cannot be resumed with other settings ({differences}): {replaces}")
         if not np.array_equal(run.emissions.ions, run.emissions.ions[0] + np.arange(len(run))):
-            raise FileError(f"the run in {name!r} cannot be resumed: some of its ions are missing")
+            raise FileError(f"the run in {name!r} cannot be resumed, some of its ions are missing: {replaces}")
         if len(run) > n_ions:
             raise FileError(
-                f"n_ions (--ions) must be >= {len(run):,}, the number of ions of the run so far, got {n_ions:,}"
+                f"n_ions (--ions) must be >= {len(run):,}, the number of ions of the run in {name!r}, got {n_ions:,}: "
+                f"{replaces}"
             )
         if not is_unfinished and run.state is None:
-            raise FileError(f"the run in {name!r} cannot be resumed: the file contains no state")
+            raise FileError(f"the run in {name!r} cannot be resumed, the file contains no state: {replaces}")
         self.previous, self._n_written = run, len(run)
         self.complete = not is_unfinished and not run.ended and len(run) == n_ions
 

@@ -18,6 +18,7 @@ _BROADEST = 0.01  # error of the time zero over the shortest time of flight: a l
 _VARIED = 0.02  # standard deviation of the voltage over its mean, from which it shows the time zero
 _SAMPLE = 50_000  # ions of a spectrum whose sharpness is measured
 _LATEST, _TIMES = 0.08, 81  # largest time zero over the median time of flight that is tried; number of times
+_FAR = 3.0  # errors of the length
 _SHARPER = 1.1  # sharpness over that at the start
 
 
@@ -37,6 +38,8 @@ class FlightFit:
         Standard errors [mm], [ns]; infinite without a peak, and that of a time that was not fitted.
     peaks : tuple of str
         Names of the peaks of the fit.
+    nominal : float
+        Distance that was given [mm]; NaN if it is not known.
     """
 
     distance: float
@@ -44,6 +47,7 @@ class FlightFit:
     distance_error: float = math.inf
     time_zero_error: float = math.inf
     peaks: tuple[str, ...] = ()
+    nominal: float = math.nan
 
     def __str__(self) -> str:
         distance, time = f"flight length {self.distance:.2f}", f"t0 = {self.time_zero:.4g}"
@@ -51,9 +55,22 @@ class FlightFit:
             return f"m/n with {distance} mm and {time} ns, not fitted"
         fitted = f"m/n with {distance} ± {self.distance_error:.2g} mm"
         if math.isfinite(self.time_zero_error):
-            return f"{fitted} and t0 = {self.time_zero:.1f} ± {self.time_zero_error:.1g} ns, fitted to {self._names}"
-        alone = "alone cannot" if len(self.peaks) == 1 else "cannot"
-        return f"{fitted} and {time} ns: {self._names} {alone} separate a time from a length, so only this is fitted"
+            text = f"{fitted} and t0 = {self.time_zero:.1f} ± {self.time_zero_error:.1g} ns, fitted to {self._names}"
+        else:
+            alone = "alone cannot" if len(self.peaks) == 1 else "cannot"
+            text = f"{fitted} and {time} ns: {self._names} {alone} separate a time from a length, so only this is "
+            text += "fitted"
+        apart = self.distance - self.nominal
+        if not abs(apart) > _FAR * self.distance_error:
+            return text
+        voltage = (self.nominal / self.distance) ** 2 - 1
+        change = f"about {abs(voltage):.0%} {'more' if voltage > 0 else 'less'} would do the same"
+        time = "" if math.isfinite(self.time_zero_error) else "the time zero, "
+        return (
+            f"{text}; this is {abs(apart):.2f} mm, {abs(apart) / self.distance_error:.0f} of its errors, "
+            f"{'above' if apart > 0 else 'below'} the {self.nominal:g} mm that were given: check that length, "
+            f"{time}the voltages ({change}) and the names of the peaks"
+        )
 
     @property
     def _names(self):

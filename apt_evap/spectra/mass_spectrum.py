@@ -164,6 +164,15 @@ class Spectrum:
         return "\n".join([*lines, *str(self.composition).splitlines()[1:]])
 
     @property
+    def main_element(self) -> str | None:
+        """Formula of more than half of the named ions, None without one."""
+        ions: dict[str, float] = {}
+        for ion in self.ions:
+            ions[ion.formula] = ions.get(ion.formula, 0) + ion.ions
+        most = max(ions, key=lambda formula: ions[formula], default=None)
+        return most if most is not None and ions[most] > 0.5 * math.fsum(ions.values()) else None
+
+    @property
     def ranged(self) -> bool:
         """Whether the ions are those of ranges."""
         return isinstance(self._source, _Ranged)
@@ -272,6 +281,22 @@ class Spectrum:
             _, place, number = np.unique(pulse, return_inverse=True, return_counts=True)
             alone = number[place] == 1
         return self._source.losses(_detected(self.hits[alone]), _detected(self.hits[~alone]), self.composition)
+
+    def dead_time_note(self, alone: NDArray[np.bool_] | None = None) -> str:
+        """Sentence about losses by dead time that move the composition by more than its error, str.
+
+        "" without such losses, and where they cannot be measured: without a composition, without pulses, and with
+        ranges.
+
+        Parameters
+        ----------
+        alone : ndarray of bool, optional
+            As for `losses`.
+        """
+        if self.ranged or self.composition.refused or (alone is None and self.hits.pulse_id is None):
+            return ""
+        losses = self.losses(alone)
+        return f"{losses}" if losses.matters else ""
 
     def background(self, edges: Floats) -> Floats:
         """Number of ions of the background between edges of m/n [Da], shape (k + 1,), array of shape (k,)."""
@@ -510,7 +535,7 @@ def spectrum(
             lacking = ", ".join(missing) if missing else "distance"
             raise ValueError(f"a spectrum needs mass_to_charge, or times of flight with {lacking}, got {hits!r}")
         flight = FlightFit(check_number(distance, "distance", above=0, unit="mm"), time_zero)
-        flight = fitted_flight(hits, flight, formulas)
+        flight = replace(fitted_flight(hits, flight, formulas), nominal=distance)
         hits = replace(hits, mass_to_charge=flight.masses(hits))
     else:
         _warn_of_masses(hits)

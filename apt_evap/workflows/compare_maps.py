@@ -115,6 +115,7 @@ def compare(
         if folder is not None:
             folder = check_path(folder)
             _check_folder(folder, overwrite)
+            done, place = ("replaced", "in") if (folder / STUDY).exists() else ("wrote", "to")
         source = source_of(measured)
         content = source.read(note)
         simulated, path = _run_and_file(run)
@@ -144,7 +145,7 @@ def compare(
     note("\n".join(study.lines()))
     if folder is not None:
         check = f"; check {OVERLAY}, --registration sets a known registration" if study.registration.doubtful else ""
-        note(f"wrote {', '.join(FILES)} to {folder}{check}")
+        note(f"{done} {', '.join(FILES)} {place} {folder}{check}")
     return study
 
 

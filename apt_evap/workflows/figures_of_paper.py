@@ -660,7 +660,8 @@ def _say_time(runs, figures, note):
     size = f"{runs.size.name} size, R = {runs.size.radius} a"
     parts = [f"{len(missing)} runs {sum(missing.values()):.0f} min"] if missing else ["all runs are there"]
     parts += [f"fits {fits:.0f} min"] if fits else []
-    note(f"{size}: about {max(total, 1):.0f} minutes of one processor ({', '.join(parts)})")
+    minutes = max(round(total), 1)
+    note(f"{size}: about {minutes} minute{'s' * (minutes > 1)} of one processor ({', '.join(parts)})")
 
 
 def _write(folder, figure, described):

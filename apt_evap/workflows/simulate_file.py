@@ -194,7 +194,7 @@ def simulate(
     seconds = time.perf_counter() - began
     if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
         if picture.exists():
-            note(f"{path} is complete: nothing to do")
+            note(f"{path} is complete: nothing to do, overwrite=True (--force) begins again")
             return Simulated(run, path, None, [], [], seconds)
         note(f"{path} is complete")
         return _drawn(run, path, picture, config, seconds, note)
@@ -222,10 +222,10 @@ def _drawn(run, path, picture, config, seconds, note):
 
     try:
         maps, titles = run_maps(run, config.maps)
-        save_picture(picture, maps, titles, title=specimen_title(run))
+        done = save_picture(picture, maps, titles, title=specimen_title(run))
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
-    note(f"wrote {picture}")
+    note(done)
     return Simulated(run, path, picture, maps, titles, seconds)
 
 

@@ -39,8 +39,8 @@ def save_picture(
     *,
     width: float | None = None,
     **colors: Any,
-) -> None:
-    """Draw maps side by side into a file, perhaps with the poles of a crystal.
+) -> str:
+    """Draw maps side by side into a file, perhaps with the poles of a crystal; return what `save_figure` does.
 
     With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
     """
@@ -53,18 +53,23 @@ def save_picture(
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
-    save_figure(path, axes[0].figure)
+    return save_figure(path, axes[0].figure)
 
 
-def save_figure(path: Path, figure: Any) -> None:
-    """Write a figure; it is drawn in memory, so that a kill in the second that it takes leaves no temporary file."""
+def save_figure(path: Path, figure: Any) -> str:
+    """Write a figure; return "wrote PATH" or "replaced PATH".
+
+    It is drawn in memory, so that a kill in the second that it takes leaves no temporary file.
+    """
     suffix, drawn = path.suffix.lower(), io.BytesIO()
     try:
         figure.savefig(drawn, format=suffix[1:], dpi=DPI, metadata={_MARK_KEYS[suffix]: _MARK})
     except OSError as error:  # such as a font that cannot be read
         raise FileError(f"cannot write {str(path)!r}: {error.strerror or error}") from error
+    done = "replaced" if path.exists() else "wrote"
     with replace_file(path) as file:
         file.write(drawn.getbuffer())
+    return f"{done} {path}"
 
 
 def is_picture(path: Path) -> bool:

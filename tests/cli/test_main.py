@@ -1,3 +1,4 @@
+import importlib
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from systems import MODES, PIPES, TERMINAL
 
 from apt_evap import __version__, cli, plot
 from apt_evap.cli import _progress
+from apt_evap.cli import main as cli_main
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import EXIT_CODES
 from apt_evap.detection.hits import Hits
@@ -125,7 +127,9 @@ def test_run_foretells_its_time_and_says_what_it_does_before_the_first_ion(folde
     monkeypatch.setattr("apt_evap.simulation.config.simulation_file.Config.simulation", simulation)
     assert main(["run", "small.toml", "--ions", "50"]) == 2
     (told,) = told_before
-    assert "50 ions of " in told and " GB, " in told and " min" in told and "surface" in told
+    assert (
+        "50 ions of " in told and " GB, " in told and re.search(r", \d+ s of one thread\n", told) and "surface" in told
+    )
 
 
 def test_the_bar_of_a_run_fits_a_terminal(monkeypatch, capsys):
@@ -173,13 +177,14 @@ def datasets(path):
 @NO_PICTURES
 def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
-    assert main(["run", "small.toml", "--resume", "--checkpoint", "0"]) == 0
+    assert main(["run", "small.toml", "--checkpoint", "0"]) == 0  # with --resume or without, the run goes on
     out = capsys.readouterr().out
     assert "resumed at 25 of 60 ions\n" in out and "60 ions, 35 of them new, in" in out
     assert "wrote small.h5" in out
     before = (folder / "small.h5").stat()
-    assert main(["run", "small.toml", "--resume"]) == 0
-    assert capsys.readouterr().out.endswith("small.h5 is complete: nothing to do\n")
+    assert main(["run", "small.toml"]) == 0
+    told = "small.h5 is complete: nothing to do, overwrite=True (--force) begins again\n"
+    assert capsys.readouterr().out.endswith(told)
     assert main(["run", "small.toml", "--resume", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["wrote"] is None and told["ions"] == 60
@@ -192,9 +197,8 @@ def test_a_run_is_made_longer_by_resume(folder, made, capsys):
     assert "seed is 1 in the stored run, 2 in the new one" in failed(
         capsys, "run", "small.toml", "--resume", "--seed", "2", "--quiet"
     )
-    assert "(--ions) must be >= 60, the number of ions of the run so far, got 50" in failed(
-        capsys, "run", "small.toml", "--resume", "--ions", "50", "--quiet"
-    )
+    fewer = "(--ions) must be >= 60, the number of ions of the run in 'small.h5', got 50: overwrite=True (--force)"
+    assert fewer in failed(capsys, "run", "small.toml", "--ions", "50", "--quiet")
 
 
 @NO_PICTURES
@@ -202,15 +206,15 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
     assert main(["run", "small.toml", "--ions", "25", "--quiet"]) == 0
     load("small.h5").ended_by("unfinished").save("small.h5.unfinished")
     os.unlink("small.h5")
-    message = failed(capsys, "run", "small.toml", "--quiet")
-    assert "unfinished run of 25 ions" in message and "(--resume) continues it" in message
+    message = failed(capsys, "run", "small.toml", "--seed", "2", "--quiet")
+    assert "'small.h5' cannot be resumed with other settings (seed" in message and "(--force) replaces it" in message
     assert main(["info", "small.h5.unfinished"]) == 0
     told = capsys.readouterr().out
-    assert "unfinished run of 25 ions" in told and "continue with the same command and --resume" in told
+    assert "unfinished run of 25 ions" in told and "the same command goes on" in told
     assert "No such file or directory; an unfinished run is in 'small.h5.unfinished'" in failed(
         capsys, "info", "small.h5"
     )
-    assert main(["run", "small.toml", "--quiet", "--resume", "--ions", "30"]) == 0
+    assert main(["run", "small.toml", "--quiet", "--ions", "30"]) == 0
     assert len(load("small.h5")) == 30
     os.rename("small.h5", "small.h5.unfinished")
     assert main(["run", "small.toml", "--quiet", "--force", "--ions", "5"]) == 0
@@ -220,27 +224,23 @@ def test_an_unfinished_run_is_resumed_or_replaced_as_requested(folder, made, cap
 
 @pytest.mark.slow
 @NO_PICTURES
-def test_a_second_run_overwrites_the_first_but_nobody_elses_files(folder, capsys):
+def test_a_run_is_replaced_with_force_only_and_so_are_files_of_others(folder, capsys):
     quick = ["run", "small.toml", "--ions", "5", "--quiet"]
     assert main(quick) == 0
-    assert main(quick[:-1]) == 0
-    assert "replaced small.h5\nwrote small.png\n" in capsys.readouterr().out
     created = (folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns
     assert main(quick) == 0
-    assert created[0] < (folder / "small.h5").stat().st_mtime_ns
-    assert created[1] < (folder / "small.png").stat().st_mtime_ns
-
     with_seed = (
-        "small.h5' contains a run with other settings (seed is 1 in the stored run, 2 in the new one): "
+        "small.h5' cannot be resumed with other settings (seed is 1 in the stored run, 2 in the new one): "
         "overwrite=True (--force) replaces it"
     )
     assert with_seed in failed(capsys, *quick, "--seed", "2")
-    assert "small.h5' contains a run of 5 ions, more than the requested 4: overwrite=True (--force)" in failed(
-        capsys, *quick, "--ions", "4"
-    )
+    assert created == ((folder / "small.h5").stat().st_mtime_ns, (folder / "small.png").stat().st_mtime_ns)
+    assert main([*quick[:-1], "--force"]) == 0
+    assert "replaced small.h5\nreplaced small.png\n" in capsys.readouterr().out
+    assert created[0] < (folder / "small.h5").stat().st_mtime_ns
+    assert created[1] < (folder / "small.png").stat().st_mtime_ns
     load("small.h5").ended_by("interrupted").save("small.h5")
-    assert "an incomplete run of 5 ions (interrupted): resume=True (--resume)" in (failed(capsys, *quick))
-    assert main([*quick, "--force"]) == 0
+    assert main(quick) == 0  # goes on
 
     (folder / "small.png").write_bytes(b"a photograph")
     assert "'small.png' exists and was not made by apt-evap: --force overwrites it" in failed(capsys, *quick)
@@ -422,6 +422,24 @@ def test_an_interrupted_exec_of_a_library_does_not_change_the_exit_code(tmp_path
     assert ended.returncode == 130 and "apt-evap info a" in ended.stderr
 
 
+def test_a_signal_during_an_import_is_not_lost(tmp_path, monkeypatch, capsys):
+    """As in the beginning of modules of Cython."""
+    (tmp_path / "swallowing.py").write_text(
+        "import signal, time\ntry:\n    signal.raise_signal(signal.SIGTERM)\n    time.sleep(0.1)\nexcept:\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def execute(_):
+        importlib.import_module("swallowing")
+        for _ in range(500):
+            time.sleep(0.01)
+        return 0
+
+    monkeypatch.setattr(cli_main, "_execute", execute)
+    assert main(["info", "a"]) == 143 and "swallowing" in sys.modules
+    assert "interrupted, nothing is kept; to start again: apt-evap info a" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
     """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""
@@ -591,7 +609,7 @@ def test_info_of_measured_ions(measured, capsys):
     text = capsys.readouterr().out
     assert re.search(r"^  voltage \[V\] +3000 to 5000$", text, re.M)
     assert re.search(r"^detector extent \[mm\] +40 x 40$", text, re.M)
-    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions$", text, re.M)
+    assert re.search(r"^absent or zero throughout +time_of_flight   pulse_voltage   positions   pulses$", text, re.M)
 
 
 def test_info_of_what_cannot_be_read(measured, made, capsys):

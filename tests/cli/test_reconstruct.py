@@ -1,6 +1,7 @@
 """`apt-evap reconstruct`, of measured ions and of a run."""
 
 import json
+import re
 from argparse import Namespace
 
 import numpy as np
@@ -69,7 +70,8 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
     )
     assert main([*command, "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
-    assert result["settings"]["distance"] == 100.0
+    assert result["settings"]["distance"] == 100.0 and result["settings"]["efficiency"] == 1.0
+    assert "efficiency" not in {one["name"] for one in result["assumed"]}  # all that reach the detector are in a run
     assert result["settings"]["atomic_volume"] == pytest.approx(nickel.a**3 / 4)
     assert 0 < result["errors"]["lateral_rms"] < 2.1  # the radius of the tip
     # 60 ions are too few for a sphere and for a compression: the radius of the tip, and 1.5
@@ -82,13 +84,13 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ("--element Ni", "needs constants that are not in it, got none of --distance (start with 90: mm"),
-        ("", "--distance (start with 90: mm, of straight flights"),
-        ("--distance 90", "--element (start with the main element: or the atomic volume"),
+        ("--element Ni", "'ni.epos' lacks constants, start with --distance 90 (mm, of straight flights"),
+        ("", "--element NAME (the main element; or --atomic-volume"),
+        ("--distance 90", "start with --element NAME"),
         ("--distance 90 --element Ni --radius apex", "--radius must be voltage, shank or a number [nm], got 'apex'"),
         ("--distance 90 --element Ni --radius -1", "--radius must be a finite number [nm] > 0, got -1.0"),
         ("--distance 90 --element Nix", "--element"),
-        ("--distance 90 --atomic-volume 0.01", "--evaporation-field (start with that of the main element"),
+        ("--distance 90 --atomic-volume 0.01", "start with --evaporation-field VALUE (that of the main element [V/nm]"),
         ("--distance 90 --element Ni --real-units", "--real-units needs a run (.h5)"),
         ("--distance 90 --element Ni -o ni.png", "format of 'ni.png' must be one of"),
         ("--distance 90 --element Ni --protocol geiser", "invalid choice: 'geiser'"),
@@ -109,11 +111,32 @@ def test_wrong_options_are_one_sentence(measured, capsys, tmp_path, options, sen
     assert [path.name for path in tmp_path.iterdir()] == ["ni.epos"]
 
 
-def test_ions_without_voltages(measured, capsys):
-    ae.write("flat.epos", ae.Hits(x=measured.x, y=measured.y, positions=np.zeros((2000, 3)), pulse_id=np.arange(2000)))
-    command = ["reconstruct", "flat.epos", "--element", "Ni", "--distance", "90"]
-    assert main(command) == 2 and "has no voltages: --radius shank" in capsys.readouterr().err
-    assert main([*command, "--radius", "40", "-o", "flat.xyz"]) == 0
+def test_all_that_a_file_lacks_is_named_at_once_and_is_enough(measured, tmp_path, rng, capsys):
+    """A file as exported, without voltages and with positions of its own, of nickel by its isotopes."""
+    masses = rng.choice([57.935, 59.931, 61.928], 2000, p=[0.70, 0.265, 0.035])
+    positions = rng.random((2000, 3)) * [40.0, 39.0, 75.0]
+    lateral = {"x": measured.x, "y": measured.y, "pulse_id": np.arange(2000)}
+    spread = masses * rng.normal(1, 3e-4, 2000)
+    ae.write("flat.epos", ae.Hits(**lateral, mass_to_charge=spread, positions=positions))
+    assert main(["reconstruct", "flat.epos"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "--radius voltage" not in told
+    options = re.findall(r"(--distance|--element|--radius) ([\w.]+)", told)
+    assert options == [("--distance", "90"), ("--element", "Ni"), ("--radius", "30")]
+    assert "for it has no voltages" in told and "--initial-radius 30 --shank-angle 5" in told
+    assert main(["reconstruct", "flat.epos", *(word for option in options for word in option)]) == 0
+    told = capsys.readouterr()
+    size = " x ".join(f"{length:.1f}" for length in np.ptp(np.float32(positions), axis=0))
+    assert f"the positions in 'flat.epos', {size} nm, are not used" in told.err
+    assert "assumed efficiency 1 (usual is 0.57 of straight flights" in told.out
+    ae.write("flat.pos", ae.Hits(mass_to_charge=spread, positions=positions))
+    assert (
+        main(["reconstruct", "flat.pos", "-o", "other.pos"]) == 2
+    )  # the file cannot be reconstructed with any constants
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert "'flat.pos' has no detector coordinates x and y" in told and "its own positions are what planes" in told
+    assert main(["reconstruct", "ni.epos", "--element", "Ni", "--distance", "90"]) == 0
+    assert "positions" not in capsys.readouterr().err  # all at one place: none
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.detection.timing import mass_to_charge
 from apt_evap.explore.explorer import Explorer
-from apt_evap.explore.measured_ions import IonSelection, MeasuredIons, main_element
+from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
 from apt_evap.io.measured_file import MeasuredFile
 
 pytestmark = pytest.mark.usefixtures("spectra_once")
@@ -39,8 +39,9 @@ def hits():
 
 def test_the_main_element_of_a_spectrum(hits):
     ions = MeasuredIons(hits)
-    assert main_element(ions.spectrum()) == "Si"
-    assert main_element(ae.spectrum(ae.Hits(mass_to_charge=np.random.default_rng(1).uniform(1, 100, 5000)))) is None
+    assert ions.spectrum().main_element == "Si"
+    noise = ae.Hits(mass_to_charge=np.random.default_rng(1).uniform(1, 100, 5000))
+    assert ae.spectrum(noise).main_element is None
 
 
 def test_times_of_flight_without_a_length_are_said_to_need_one(hits):

@@ -120,9 +120,8 @@ def registered(run20, monkeypatch):
 def test_a_comparison_registers_by_the_indexing(registered):
     lines, registration = registered(indexed(NEAR_111, 77.0))
     assert registration.method == "start"
-    assert lines == [
-        "the map shows [0.35 0.53 0.77], rotation 77.0°, 60.0 mm/rad, +0 % at the rim, where the run is registered"
-    ]
+    scale = "60.0 mm/rad in the centre of the map and at its rim"
+    assert lines == [f"the map shows [0.35 0.53 0.77], rotation 77.0°, {scale}, where the run is registered"]
 
 
 def test_a_comparison_searches_if_the_map_does_not_decide(registered):

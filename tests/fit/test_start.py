@@ -121,12 +121,24 @@ def test_less_time_makes_a_smaller_tip(found):
 
 def test_a_run_that_ends_with_its_time_has_spare_ions(found):
     _, indexing = found
-    usual, spare = (ae.fit.settings_of(indexing, minutes=5, spare=spare) for spare in (1.0, 1.2))
+    usual, spare = (ae.fit.settings_of(indexing, minutes=2, spare=spare) for spare in (1.0, 1.2))
     assert spare.cost == usual.cost and spare.simulated_radius == usual.simulated_radius
     ions = [tomllib.loads(start.text)["simulation"]["ions"] for start in (usual, spare)]
     assert ions[1] == pytest.approx(1.2 * ions[0], rel=1e-3)
-    most = tomllib.loads(ae.fit.settings_of(indexing, minutes=5, spare=1e3).text)["simulation"]["ions"]
+    most = tomllib.loads(ae.fit.settings_of(indexing, minutes=2, spare=1e3).text)["simulation"]["ions"]
     assert ions[1] < most <= 150_000  # the shape of the tip limits them
+
+
+def test_threads_and_what_follows_share_the_minutes(found):
+    """Two threads are 1 / (0.2 + 0.8 / 2) times as fast as one, for events follow one another."""
+    _, indexing = found
+    alone = ae.fit.settings_of(indexing, minutes=2).text
+    assert ae.fit.settings_of(indexing, minutes=4, part=0.5).text == alone
+    assert ae.fit.settings_of(indexing, minutes=2 * 0.6, threads=2).text == alone
+    with pytest.raises(ValueError, match="minutes must be at least") as refusal:
+        ae.fit.settings_of(indexing, minutes=1e-3, part=0.5)
+    least = float(str(refusal.value).split("at least ")[1].split()[0])
+    assert ae.fit.settings_of(indexing, minutes=least, part=0.5).cost.hours * 60 <= least / 2
 
 
 def test_bad_arguments_are_named(found):
@@ -163,9 +175,11 @@ def test_commands_from_a_file_to_settings(found, tmp_path, monkeypatch, capsys):
     arguments = ["start", "measured.npz", "--element", "Ni", "--scales", "56,64", "--minutes", "2", "-o", "mine.toml"]
     assert main(arguments) == 0
     assert (tmp_path / "mine.toml").read_text().startswith(MARK)
-    assert main([*arguments, "--quiet"]) == 0  # its own file is replaced
+    assert main([*arguments, "--quiet"]) == 2 and "'mine.toml' exists: --force" in capsys.readouterr().err
     (tmp_path / "mine.toml").write_text("[tip]\n")
     assert main(arguments) == 2 and "mine.toml" in capsys.readouterr().err
+    assert main([*arguments, "--force", "--quiet"]) == 0
+    assert (tmp_path / "mine.toml").read_text().startswith(MARK)
     assert main(["index", "measured.npz", "--element", "Ni", "--pole=-1,x"]) == 2
     assert "--pole" in capsys.readouterr().err
 

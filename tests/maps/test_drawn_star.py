@@ -1,6 +1,7 @@
 """Stars of drawn lines, which need no crystal, and maps that are such stars."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +81,9 @@ def test_drawn_stars_are_no_crystals(lines):
     """Both are preferred to other orientations by more than 20."""
     found = ae.index(drawn(0.3 + np.arange(lines) * math.pi / lines), "Ni")
     assert not found.decided and "without a crystal" in found.reason
+    numbers = re.search(r"evidence (\d+) .* and (-?\d+) .* where (\d+) more", found.reason)
+    of_lines, of_crystal, more = map(int, numbers.groups())
+    assert of_lines + more > of_crystal and ("better than" in found.reason) == (of_lines > of_crystal)
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Mass spectra: known ions, background, time zero and flight length are found; noise and wrong elements are not."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -82,12 +84,27 @@ def test_one_charge_state_gives_a_factor_only():
     hits = recorded({("W", 3): 1}, 310.0, 30.0, (9000, 9100))
     fit = ae.spectrum(hits, "W", distance=305.0).flight
     assert fit.time_zero == 0 and np.isinf(fit.time_zero_error) and fit.peaks == ("W³⁺",)
-    assert "cannot separate" in str(fit)
+    assert "cannot separate" in str(fit) and "check that length, the time zero, the voltages" in str(fit)
     # the factor puts the peak in its place: the length is that of the whole time of flight
     masses = fit.masses(hits)
     inside = (masses > 60) & (masses < 62.3)
     assert np.count_nonzero(inside) > 19_900
     assert abs(masses[inside].mean() / 61.28 - 1) < 2e-3
+
+
+def test_a_given_length_far_from_the_fitted_one_is_said():
+    """Both numbers, and the voltages with which the given one would be right."""
+    hits = recorded(NICKEL, 93.0, 20.0, (4000, 7000))
+    fit = ae.spectrum(hits, "Ni", distance=90.0).flight
+    errors = (fit.distance - 90.0) / fit.distance_error
+    assert errors > 3
+    told = f"this is {fit.distance - 90.0:.2f} mm, {errors:.0f} of its errors, above the 90 mm that were given"
+    assert told in str(fit) and f"{fit.distance:.2f} ± " in str(fit) and "time zero" not in str(fit)
+    (less,) = re.findall(r"voltages \(about (\d+)% less would do the same\)", str(fit))
+    changed = replace(hits, voltage=hits.voltage * (1 - float(less) / 100))
+    again = ae.spectrum(changed, "Ni", distance=90.0).flight
+    # hits off the axis have longer paths, and the percentage is rounded
+    assert again.distance == pytest.approx(90.0, abs=0.5)
 
 
 def test_ions_and_background_of_peaks_are_counted():

@@ -48,7 +48,7 @@ def test_chosen_atoms_and_what_their_caption_says(folder):
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")  # of few ions and small specimens
 def test_runs_are_made_once_and_shared(folder):
     figure, numbers, lines = made(6)
-    assert lines[0].startswith("quick size, R = 8 a: about 1 minutes of one processor (2 runs")
+    assert lines[0].startswith("quick size, R = 8 a: about 1 minute of one processor (2 runs")
     run, twin = (ae.load(f"out/runs/Ni_{role}_R8a.h5") for role in ("run", "twin"))
     # two specimens: another origin of the lattice, other random numbers
     assert run.settings["tip"]["offset_seed"] != twin.settings["tip"]["offset_seed"] and run.seed != twin.seed

@@ -170,8 +170,10 @@ class Candidate:
 
     def __str__(self):
         axis = " ".join(f"{index:.2f}" for index in self.orientation.axis)
-        scale = f"{self.projection.scale:.1f} mm/rad, {100 * self.rim_change:+.0f} % at the rim"
-        return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {scale}"
+        change = round(100 * self.rim_change)
+        rim = f", {abs(change)} % {'more' if change > 0 else 'less'} at its rim" if change else " and at its rim"
+        scale = f"{self.projection.scale:.1f} mm/rad in the centre of the map"
+        return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {scale}{rim}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,45 +523,49 @@ class _Crystal:
         """Why the best result is no single crystal, in one sentence; empty if it passes the checks it can fail."""
         if best.evidence < LEAST_EVIDENCE:
             return (
-                "only the counts prefer this orientation: its lines and poles have evidence "
-                f"{_floor(best.evidence)} over no crystal ({LEAST_EVIDENCE:g} is needed); more ions, or a marked pole "
-                "would help"
+                "only the ion density over large areas prefers this orientation: its lines and poles have evidence "
+                f"{_floor(best.evidence)} against a map without any, where {LEAST_EVIDENCE:g} is needed; more ions, or "
+                "a marked pole would help"
             )
         second, least = second_lattice(self.view, self.terms, best.fit)
         if second > SECOND_LATTICE:
             return (
-                "the map may hold a second lattice: in half of it another orientation has more evidence, by "
-                f"{_floor(second)} (at most {SECOND_LATTICE:g} is allowed); a map of one grain would help"
+                "the map may hold a second lattice: the lines and poles in half of it fit another orientation better, "
+                f"with evidence {_floor(second)} over this one, where {SECOND_LATTICE:g} is allowed; a map of one "
+                "grain would help"
             )
         limit = UNSEEN + PART * best.evidence
         if best.evidence > CLEAR and least < limit:
             return (
-                "the map may hold a second lattice: the local contrast of the whole map has evidence "
-                f"{_floor(best.evidence)} for the orientation, but {_floor(least)} in a half of it (at least "
-                f"{_floor(limit)} is needed); a map of one grain, or another part of the map would help"
+                "the map may hold a second lattice: the lines and poles of the whole map have evidence "
+                f"{_floor(best.evidence)} for the orientation, but those in half of it {_floor(least)}, where "
+                f"{_floor(limit)} is needed; a map of one grain, or another part of the map would help"
             )
         grain = second_grain(self.view, self.terms, best.fit)
         if grain.evidence > SECOND_GRAIN:
             return (
                 f"the map may hold a second grain: farther than {grain.chord:g} radii towards {grain.azimuth:.0f} "
-                f"degrees another orientation has more evidence, by {_floor(grain.evidence)} (at most "
-                f"{SECOND_GRAIN:g} is allowed); a map of one grain would help"
+                f"degrees lines and poles fit another orientation better, with evidence {_floor(grain.evidence)} "
+                f"over this one, where {SECOND_GRAIN:g} is allowed; a map of one grain would help"
             )
         star = best_star(self.view.picture)
         if star.evidence > SEEN_STAR and best.evidence < star.evidence + OVER_STAR:
+            lines = f"{star.lines} straight line{'s' * (star.lines > 1)} through one point"
+            about = "better than" if star.evidence > best.evidence else "about as well as"
             return (
-                f"a drawing explains the local contrast without a crystal: {star.lines} line{'s' * (star.lines > 1)} "
-                f"through one point, with evidence {_floor(star.evidence)}; this orientation has "
-                f"{_floor(best.evidence)} ({OVER_STAR:g} more than the drawing are needed); a wider field of view, or "
-                "a marked pole would help"
+                f"{lines}, at any angles and without a crystal, explain{'s' * (star.lines == 1)} the bright and dark "
+                f"features of the map {about} this orientation does: evidence {_floor(star.evidence)} for the "
+                f"{'line' if star.lines == 1 else 'lines'} and {_floor(best.evidence)} for the orientation, where "
+                f"{OVER_STAR:g} more than for the lines are needed; a wider field of view with a second pole, or a "
+                "marked pole would help"
             )
         surrogates = surrogates_of(self.view, self.search, self.terms, self.densities, self.bounds, best.fit)
         if surrogates.above or surrogates.deviations <= ABOVE_SURROGATES:
             return (
                 "maps with the same rings and lines at random azimuths are explained about as well: this one is "
-                f"{surrogates.deviations:.1f} standard deviations above their mean, {surrogates.above} of "
-                f"{len(surrogates.weights)} are above it (more than {ABOVE_SURROGATES:g}, and none, are needed); more "
-                "ions or a marked pole would help"
+                f"{surrogates.deviations:.1f} standard deviations above their mean, where more than "
+                f"{ABOVE_SURROGATES:g} are needed, and {surrogates.above} of {len(surrogates.weights)} are above it, "
+                "where none may be; more ions or a marked pole would help"
             )
         return ""
 
@@ -579,16 +585,17 @@ def _checked(result, crystal, best, dispersion, weight, told):
         preferred = len(weights) == 1 or weights[0] - weights[1] > DECIDED
         if excess > UNPROVED or (preferred and not rival.refusal(different[0])):
             return replace(result, decided=False, reason=(
-                f"a {structure} crystal explains the map better, by {_floor(excess)}; if the specimen is {name}, "
-                f"bounds of the scale or a marked pole would help, and if not, a {structure} material"
+                f"a {structure} crystal explains the map better, with evidence {_floor(excess)} over {name}; if the "
+                f"specimen is {name}, bounds of the scale or a marked pole would help, and if not, a {structure} "
+                "material"
             ))  # fmt: skip
         return replace(result, reason=(
-            f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(excess)} more, "
-            "but does not pass the checks that this result passes"
+            f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has evidence "
+            f"{_floor(excess)} over it, but does not pass the checks that this result passes"
         ))  # fmt: skip
     return replace(result, reason=(
-        f"{result.reason}; it holds if the specimen is {name}: a {structure} crystal has {_floor(abs(excess))} "
-        f"{'more' if excess > 0 else 'less'}"
+        f"{result.reason}; it holds if the specimen is {name}: the evidence of a {structure} crystal is "
+        f"{_floor(abs(excess))} {'larger' if excess > 0 else 'smaller'}"
     ))  # fmt: skip
 
 

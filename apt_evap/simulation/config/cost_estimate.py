@@ -11,18 +11,21 @@ from apt_evap.specimen.tip import estimated_atoms
 # for R = 8, 12, 20 and 30 a.
 _PROGRAM = 1.4e8  # bytes
 _BYTES_PER_ION = 3_050  # measured: peak memory with 14,000 and 2,000 ions (R = 12 a); at the end parts are joined
-# Milliseconds per ion of one thread, and their increase per factor e in the number of surface atoms: fits to the table
-# of speeds in docs/accuracy_and_speed.rst within 7 %, from R = 20 to 120 a, times 2 for a slower or busy processor.
-_REFERENCE = 21_591  # surface atoms
-_WITH_RESPONSES = 2 * 1.30, 2 * 0.15
-# Of other designs than the usual ones with 140 launches and 102 coefficients: processor times per ion of 30 launches
-# are 0.70, 0.69 and 0.66 times as long (R = 20, 40 and 80 a); coefficients are three float32, twice at the end.
-_LAUNCHES, _PER_LAUNCH = 140, 1 / 350
+# Designs other than the usual ones with 102 coefficients: coefficients are three float32, twice at the end.
 _COEFFICIENTS, _BYTES_PER_COEFFICIENT = 102, 24
-_ONE_FLIGHT = 2 * 0.32, 2 * 0.10
-_LEAST = 0.3  # [ms], of small tips
-_START = 2 * 3e-5  # seconds per surface atom, from the same table
-_START_OF_PROGRAM = 3.0  # seconds, with the pictures of the maps
+# Milliseconds of one thread per ion of a tip with _REFERENCE surface atoms: its event, the flights of its responses,
+# and that of an emission; all with their increase per factor e in the number of surface atoms. Of 49 runs of 500 to
+# 1,000 ions (nine materials, R = 8 to 100 a, both rules of charges, 30 and 140 launches, one to three emissions, fields
+# of view, rates at 50 K) every second one was used for the fit: estimates over processor times are 0.81 to 1.25. Those
+# of the other 24 are 0.85 to 1.13, but for 0.69 (R = 100 a at a constant potential) and three of 1.24 to 1.36 (R = 12 a
+# with 30 launches, R = 40 a with one flight, half of the ions outside the field of view). AMD EPYC, while other
+# programs ran.
+_REFERENCE = 21_591  # surface atoms
+_EVENT, _RESPONSES, _LAUNCH, _EMISSION, _GROWTH = 0.34, 0.27, 0.0023, 0.033, 0.087
+# Seconds per atom in memory until the first ion: 1.6 to 3.4 us in the same 25 runs, 0.95 with silicon; 1.3 to 3.0 us in
+# the other 24
+_START = 2.15e-6
+_START_OF_PROGRAM = 3.0  # seconds, with the pictures of the maps: 3.2 s with 200 ions of a tip of R = 6 a
 
 
 @settings
@@ -37,7 +40,8 @@ class CostEstimate:
     surface_atoms: float | None = number("Atoms on the surface.", default=None, at_least=0)
     memory: float | None = number("Peak memory, within about 30 %.", default=None, at_least=0, unit="bytes")
     hours: float | None = number(
-        "Time of one thread, within a factor of 3; finished points correct it (`status`).",
+        "Time of one thread, on a processor like the measured one within a third; finished points correct it "
+        "(`status`).",
         default=None,
         at_least=0,
         unit="h",
@@ -50,8 +54,10 @@ class CostEstimate:
 
 
 def hours_text(hours: float) -> str:
-    """Text of a time in hours or minutes, str."""
-    return f"{hours:.2g} h" if hours >= 1 else f"{60 * hours:.2g} min"
+    """Text of a time in hours, minutes or seconds, str."""
+    if hours >= 1:
+        return f"{hours:.2g} h"
+    return f"{60 * hours:.2g} min" if 60 * hours >= 1 else f"{3600 * hours:.0f} s"
 
 
 def estimate_cost(config: Config, threads: int) -> CostEstimate:
@@ -61,15 +67,14 @@ def estimate_cost(config: Config, threads: int) -> CostEstimate:
     except TypeError:  # a specimen without apex_radius
         return CostEstimate(config.n_ions, None, None, None, None)
     memory = _PROGRAM + needed_memory(atoms, surface) + copied_memory(surface, threads)
-    bytes_per_ion, flights, per_flight = _BYTES_PER_ION, max(1, len(config.emissions)), _ONE_FLIGHT
+    bytes_per_ion, per_ion = _BYTES_PER_ION, _EVENT + _EMISSION * len(config.emissions)
     if config.responses:
         designs = config.response_settings.designs
         launches = sum(len(design.launches) for design in designs)
         coefficients = sum(len(design.exponents) for design in designs)
         bytes_per_ion += _BYTES_PER_COEFFICIENT * (coefficients - _COEFFICIENTS)
-        flights, per_flight = 1 + _PER_LAUNCH * (launches - _LAUNCHES), _WITH_RESPONSES
+        per_ion += _RESPONSES + _LAUNCH * launches
     memory += bytes_per_ion * config.n_ions
-    base, slope = (flights * value for value in per_flight)
-    per_ion = max(_LEAST, base + slope * math.log(surface / _REFERENCE))
-    seconds = _START_OF_PROGRAM + _START * surface + 1e-3 * per_ion * config.n_ions
+    per_ion *= max(1 + _GROWTH * math.log(surface / _REFERENCE), 0.5)
+    seconds = _START_OF_PROGRAM + _START * atoms + 1e-3 * per_ion * config.n_ions
     return CostEstimate(config.n_ions, atoms, surface, memory, seconds / 3600)
