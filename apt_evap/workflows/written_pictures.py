@@ -45,6 +45,7 @@ def save_picture(
     With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
     """
     from apt_evap.detection.color_limits import common_limits  # with Matplotlib
+    from apt_evap.plot.pole_labels import legend_of_poles
 
     if width is None:
         axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title, **colors)
@@ -53,6 +54,8 @@ def save_picture(
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
+        if width is None:
+            legend_of_poles(axes)
     save_figure(path, axes[0].figure)
 
 

@@ -430,6 +430,50 @@ def test_isotopes_are_labelled_where_there_are_peaks():
     assert 12 < low < 14 and 18 < high < 20  # without the background
 
 
+def overlapping(texts):
+    """Pairs of visible texts whose boxes overlap, in pixels."""
+    boxes = [Text.get_window_extent(text) for text in texts if text.get_visible()]
+    return [(a, b) for number, a in enumerate(boxes) for b in boxes[:number] if a.overlaps(b)]
+
+
+def test_labels_of_near_peaks_are_apart_and_those_of_the_largest_are_there(rng):
+    peaks = {"H": 1.0, "H2": 2.0, "C": 12.0, "Si": 14.0, "O": 16.0, "OH": 17.0, "H2O": 18.0, "Si+": 28.0, "CO": 28.6}
+    number = dict(zip(peaks, (9000, 6000, 150, 40_000, 220, 40, 160, 2500, 30), strict=True))
+    mass = np.concatenate([rng.normal(peaks[name], 0.01, number[name]) for name in peaks])
+    ions = ae.Hits(mass_to_charge=np.concatenate([mass, rng.uniform(0.5, 110, 2000)]))
+    at = np.array(list(peaks.values()))
+    ranges = ae.spectra.Ranges(names=tuple(peaks), low=at - 0.1, high=at + 0.1)
+    ax = plot.spectrum(ae.spectrum(ions, elements=["Si"]), ranges=ranges)
+    ax.figure.draw_without_rendering()
+    visible = {text.get_text() for text in ax.texts if text.get_visible()}
+    assert {"H", "H2", "C", "Si", "O", "H2O", "Si+"} <= visible
+    assert not overlapping([*ax.texts, *ax.get_legend().get_texts()])
+    frame = ax.get_window_extent()
+    counts, edges, _ = ax.patches[0].get_data()
+    for text in ax.texts:
+        box = Text.get_window_extent(text)
+        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and box.y1 <= frame.y1
+        left, right = ax.transData.inverted().transform([(box.x0, 1), (box.x1, 1)])[:, 0]
+        below = counts[(edges[1:] > left) & (edges[:-1] < right)].max()
+        assert box.y0 > ax.transData.transform((left, below))[1]  # above the curve
+    # in a small picture, too
+    small = plot.new_figure((3.4, 2.2)).subplots()
+    plot.spectrum(ae.spectrum(ions, elements=["Si"]), ax=small, ranges=ranges)
+    small.figure.draw_without_rendering()
+    shown = [text.get_text() for text in small.texts if text.get_visible()]
+    assert {"Si", "H", "H2"} <= set(shown)
+    assert not overlapping(small.texts)
+
+
+def test_near_ranges_of_one_name_have_one_label_and_hydrogen_one_charge(rng):
+    mass = np.concatenate([rng.normal(at, 0.01, 900) for at in (1.008, 58.0, 60.0)])
+    hits = ae.Hits(mass_to_charge=np.concatenate([mass, rng.uniform(0.1, 90, 3000), np.full(40, 0.252)]))
+    ranges = ae.spectra.Ranges(names=("Ni", "Ni", "H"), low=[57.9, 59.9, 0.9], high=[58.1, 60.1, 1.1])
+    ax = plot.spectrum(ae.spectrum(hits, elements=["Ni"]), ranges=ranges)
+    assert sorted(text.get_text() for text in ax.texts) == ["H", "Ni"]
+    assert {text.get_text() for text in plot.spectrum(hits, elements=["H"]).texts} == {"$^{1}$H$^{{+}}$"}
+
+
 def test_spectra_that_cannot_be_drawn(run, real):
     hits = real.hits(ae.Unperturbed())
     for ions, options, message in (

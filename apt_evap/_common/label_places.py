@@ -1,0 +1,113 @@
+"""Places of labels in a picture, so that none overlaps another one or what is drawn [pixels]."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from apt_evap._common.types import Floats
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, right and top."""
+_GAP = 3.0  # between a curve and its label
+_LINE = 1.0  # half width of the line from a peak to its label
+_STEPS = 16  # half heights of a label, by which it rises at most
+_TRIES = 8  # orders of the labels
+_IN_THE_WAY = 3.0  # heights of a label that its place is worse for each other peak that it hides
+
+
+def place_labels(
+    options: Sequence[Iterable[Sequence[Box]]], area: Box, taken: Iterable[Box] = ()
+) -> list[Sequence[Box] | None]:
+    """First free option of each label, the most important label first; None for a label without a free one.
+
+    Parameters
+    ----------
+    options : sequence
+        Of each label its options, the best first: boxes that it covers, that of its text first.
+    area : tuple of float
+        Box of all texts.
+    taken : iterable of tuple of float
+        Boxes of what is drawn already.
+    """
+    covered = np.array(list(taken), dtype=float).reshape(-1, 4)
+    placed: list[Sequence[Box] | None] = []
+    for boxes_of_options in options:
+        placed.append(None)
+        for boxes in boxes_of_options:
+            left, bottom, right, top = boxes[0]
+            inside = left >= area[0] and bottom >= area[1] and right <= area[2] and top <= area[3]
+            if inside and not any(_overlaps(box, covered) for box in boxes):
+                covered = np.concatenate([covered, np.array(boxes)])
+                placed[-1] = boxes
+                break
+    return placed
+
+
+def place_above(
+    peaks: Floats,
+    sizes: Floats,
+    area: Box,
+    highest: Callable[[float, float], float],
+    taken: Iterable[Box] = (),
+) -> list[Sequence[Box] | None]:
+    """Boxes of the labels of peaks, above a curve: that of the text, and that of a line down to the peak.
+
+    Parameters
+    ----------
+    peaks : ndarray, shape (n, 2)
+        Tops of the peaks, the most important first.
+    sizes : ndarray, shape (n, 2)
+        Widths and heights of the labels.
+    area : tuple of float
+        Box of all texts.
+    highest : callable
+        The highest point of the curve from the left to the right.
+    taken : iterable of tuple of float
+        Boxes of what is drawn already.
+    """
+    options = [
+        _above(peak, size, np.delete(peaks[:, 0], number), area, highest)
+        for number, (peak, size) in enumerate(zip(peaks, sizes, strict=True))
+    ]
+    obstacles, order = list(taken), list(range(len(options)))
+    best: list[Sequence[Box] | None] = []
+    for _ in range(_TRIES):
+        in_order = place_labels([options[number] for number in order], area, obstacles)
+        placed = [boxes for _, boxes in sorted(zip(order, in_order, strict=True), key=lambda pair: pair[0])]
+        if not best or [boxes is not None for boxes in placed] > [boxes is not None for boxes in best]:
+            best = placed
+        if None not in placed:
+            break
+        left_out = placed.index(None)  # the most important one: it is placed first now
+        order.remove(left_out)
+        order.insert(0, left_out)
+    return best
+
+
+def _above(peak, size, others, area, highest):
+    """Options of a label: over its peak, to its right or left, beside it, and higher; the nearest first."""
+    (x, y), (width, height) = peak, size
+    options = []
+    for shift in (-0.5, 0.0, -1.0, 0.5, -1.5):
+        left = min(max(x + shift * width, area[0]), area[2] - width)
+        hidden = np.count_nonzero((others > left - _GAP) & (others < left + width + _GAP))
+        worse = (_IN_THE_WAY * hidden + abs(shift + 0.5)) * height
+        lowest = max(highest(left, left + width), y) + _GAP
+        for bottom in lowest + 0.5 * height * np.arange(_STEPS):
+            text = left, bottom, left + width, bottom + height
+            end = end_of_line((x, y), text)[0]
+            if end != x and highest(min(x, end), max(x, end)) > y + _LINE:
+                break  # a line beside the peak would cross the curve
+            line = min(x, end) - _LINE, y, max(x, end) + _LINE, bottom
+            options.append((bottom + worse, (text, line)))
+    return [boxes for _, boxes in sorted(options)]
+
+
+def end_of_line(peak: Sequence[float], text: Box) -> tuple[float, float]:
+    """End of a line from a peak to its label."""
+    return min(max(peak[0], text[0]), text[2]), text[1]
+
+
+def _overlaps(box, boxes):
+    left, bottom, right, top = boxes.T
+    return np.any((box[0] < right) & (left < box[2]) & (box[1] < top) & (bottom < box[3]))
