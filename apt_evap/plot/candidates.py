@@ -9,7 +9,7 @@ from apt_evap._common.validation import check_count, check_kind
 from apt_evap.detection.color_limits import common_limits
 from apt_evap.maps.indexing.index_map import SHOWN, Indexing
 from apt_evap.plot._figure import add_colorbar, new_figure, with_default_settings
-from apt_evap.plot.map_figures import color_limits, detector_map
+from apt_evap.plot.map_figures import color_limits, detector_map, wrapped
 from apt_evap.plot.pole_labels import legend_of_poles, poles
 
 _CHARACTERS = 12  # of the title of the figure, per inch
@@ -53,8 +53,7 @@ def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.o
         grid[1, 0].remove()
         axes = np.concatenate([grid[0, :1], grid[:, 1:].T.ravel()])
     lines = [f"{result.verdict}: {result.reason}", *result.deciding_marks]
-    wrapped = [textwrap.fill(line, int(_CHARACTERS * width)) for line in lines]
-    figure.suptitle("\n".join(wrapped), fontsize="medium")
+    figure.suptitle("\n".join(textwrap.fill(line, int(_CHARACTERS * width)) for line in lines), fontsize="medium")
     map = (
         result.map
         if result.map.smoothing or not result.map.is_counts

@@ -55,7 +55,7 @@ def save_picture(
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
         if width is None:
-            legend_of_poles(axes)
+            legend_of_poles(list(axes))
     save_figure(path, axes[0].figure)
 
 
