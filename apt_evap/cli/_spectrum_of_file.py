@@ -69,7 +69,15 @@ def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool
     return spectrum(ions, elements, ranges, abundances_of(options.isotope), **flight)
 
 
-def alone_of(options: argparse.Namespace) -> Any:
+def say_losses(options: argparse.Namespace, result: Any) -> None:
+    """Say whether losses by dead time move the composition by more than its error."""
+    from apt_evap.cli._output import say
+
+    if text := result.dead_time_note(_alone_of(options) if result.hits.pulse_id is None else None):
+        say("note", text)
+
+
+def _alone_of(options):
     """Whether each ion of a large file is the only one of its pulse, bool (n,); None if its pulses are not known."""
     import numpy as np
 

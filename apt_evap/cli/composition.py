@@ -3,8 +3,8 @@
 import argparse
 
 from apt_evap.cli._options import add_speech
-from apt_evap.cli._output import say, tell, tell_json
-from apt_evap.cli._spectrum_of_file import add_spectrum, alone_of, spectrum_of
+from apt_evap.cli._output import tell, tell_json
+from apt_evap.cli._spectrum_of_file import add_spectrum, say_losses, spectrum_of
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,11 +35,6 @@ def execute(options: argparse.Namespace) -> int:
     if not result.ions and not result.unexplained:
         raise ValueError(f"a composition needs peaks, {options.file!r} has none above the background: {result.hits!r}")
     tell(options, f"{result}")
-    if result.composition.at_percent and not result.ranged:
-        alone = alone_of(options) if result.hits.pulse_id is None else None
-        if alone is not None or result.hits.pulse_id is not None:
-            losses = result.losses(alone)
-            if losses.matters:
-                say("note", f"{losses}")
+    say_losses(options, result)
     tell_json(options, result.composition.plain())
     return 0

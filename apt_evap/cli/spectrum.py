@@ -5,7 +5,7 @@ from pathlib import Path
 
 from apt_evap.cli._options import add_speech
 from apt_evap.cli._output import tell, tell_json
-from apt_evap.cli._spectrum_of_file import add_spectrum, spectrum_of
+from apt_evap.cli._spectrum_of_file import add_spectrum, say_losses, spectrum_of
 
 _BIN = 0.05  # of the picture [Da]: narrower ones would be less than a pixel
 
@@ -62,6 +62,7 @@ def execute(options: argparse.Namespace) -> int:
     ranges = None if options.ranges is None else read_ranges(options.ranges)
     result = spectrum_of(options, ranges, pulses=pairs is not None)
     tell(options, f"{result}")
+    say_losses(options, result)
     if result.flight is not None and result.flight.peaks:
         fit = result.flight
         tell(options, f"for other commands: --distance {fit.distance:.2f} --t0 {fit.time_zero:.2f}")

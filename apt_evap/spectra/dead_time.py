@@ -39,11 +39,14 @@ class DeadTimeLoss:
     def __str__(self) -> str:
         if not self.lost:
             return "dead time: no ion has enough ions of two isotopes, alone and with others, to measure its losses"
-        parts = ", ".join(f"{name} {part:.1%} ± {error:.1%}" for name, (part, error) in self.lost.items())
-        verdict = "more than its error" if self.matters else "not by more than its error"
-        most = max(self.shift, key=lambda element: abs(self.shift[element]), default="")
-        moved = f" by {self.shift[most]:+.2f} at.% of {most}," if most else ""
-        return f"dead time: lost in pulses with several ions {parts}; moves the composition{moved} {verdict}"
+        parts = ", ".join(f"{part:.1%} ± {error:.1%} of {name}" for name, (part, error) in self.lost.items())
+        text = f"in pulses with several ions, {parts} are lost by the dead time of the detector, as their isotopes show"
+        if not self.shift:
+            return text
+        most = max(self.shift, key=lambda element: self.shift[element])
+        verdict = "more than its error" if self.matters else "not beyond the errors"
+        moved = f"with these ions there would be {self.shift[most]:.2f} at.% more {most}, {verdict}"
+        return f"{text}; the at.% are not corrected for it: {moved}"
 
 
 def isotope_losses(

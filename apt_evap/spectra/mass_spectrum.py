@@ -273,6 +273,22 @@ class Spectrum:
             alone = number[place] == 1
         return self._source.losses(_detected(self.hits[alone]), _detected(self.hits[~alone]), self.composition)
 
+    def dead_time_note(self, alone: NDArray[np.bool_] | None = None) -> str:
+        """Sentence about losses by dead time that move the composition by more than its error, str.
+
+        "" without such losses, and where they cannot be measured: without a composition, without pulses, and with
+        ranges.
+
+        Parameters
+        ----------
+        alone : ndarray of bool, optional
+            As for `losses`.
+        """
+        if self.ranged or self.composition.refused or (alone is None and self.hits.pulse_id is None):
+            return ""
+        losses = self.losses(alone)
+        return f"{losses}" if losses.matters else ""
+
     def background(self, edges: Floats) -> Floats:
         """Number of ions of the background between edges of m/n [Da], shape (k + 1,), array of shape (k,)."""
         below = np.pad(np.cumsum(self._source.background), (1, 0))

@@ -85,12 +85,17 @@ def test_losses_of_the_dead_time_show_in_the_isotopes():
         mass_to_charge=mass[kept] * (1 + rng.normal(0, 4e-4, kept.sum()) + rng.exponential(1e-3, kept.sum())),
         pulse_id=pulse[kept],
     )
-    losses = ae.spectrum(hits, ["B", "Al"]).losses()
+    spectrum = ae.spectrum(hits, ["B", "Al"])
+    losses = spectrum.losses()
     part, error = losses.lost["B⁺"]
     # pulses that lost an ion count as single: the pairs that remain have fewer 11B than the natural ratio says
     assert part > 5 * error > 0 and losses.matters and losses.shift["B"] > 0
-    assert "more than its error" in str(losses)
+    assert spectrum.dead_time_note() == str(losses)
+    assert f"not corrected for it: with these ions there would be {losses.shift['B']:.2f} at.% more B" in str(losses)
+    assert ae.spectrum(hits, ranges=spectrum.ranges()).dead_time_note() == ""  # an ion has no rivals to be clean of
+    assert ae.spectrum(ae.Hits(mass_to_charge=hits.mass_to_charge), ["B", "Al"]).dead_time_note() == ""  # no pulses
     without = ae.Hits(
         mass_to_charge=np.where(kind, boron, 26.9815) * (1 + rng.normal(0, 4e-4, 2 * n)), pulse_id=pulse.ravel()
     )
-    assert not ae.spectrum(without[np.append(np.arange(n), n + np.arange(0, n, 2))], ["B", "Al"]).losses().matters
+    whole = ae.spectrum(without[np.append(np.arange(n), n + np.arange(0, n, 2))], ["B", "Al"])
+    assert not whole.losses().matters and whole.dead_time_note() == ""

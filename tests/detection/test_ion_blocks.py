@@ -192,7 +192,7 @@ def test_the_sample_of_blocks_is_that_of_all_ions(monkeypatch, rows):
 
 
 def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
-    """Isotopes that are lost in pulses of several ions, which a note of a composition says."""
+    """Isotopes that are lost in pulses of several ions, which a note beside every composition says."""
     monkeypatch.chdir(tmp_path)
     rows = np.concatenate([rows_of(seed=seed) for seed in range(5)]).astype(">u4")
     random = np.random.default_rng(2)
@@ -204,9 +204,10 @@ def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, cap
     given = []
     for size in (None, *SIZES[1:]):
         blocks_of(size)
-        given.append(answers(capsys, "composition", "a.epos", "--element", "Cu"))
-    assert "note" in given[0][2]
-    assert all(one == given[0] for one in given)
+        given += [answers(capsys, command, "a.epos", "--element", "Cu") for command in ("composition", "spectrum")]
+    assert "dead time" in given[0][2]
+    assert all(one[2] == given[0][2] for one in given)
+    assert all(one == given[at % 2] for at, one in enumerate(given))
 
 
 def test_a_pos_is_read_in_blocks(tmp_path, monkeypatch, capsys, blocks_of):
