@@ -43,6 +43,16 @@ def place_labels(
     return placed
 
 
+def outline(sides: Floats, tops: Floats) -> Callable[[float, float], float]:
+    """Function of the highest point of a histogram between two places, of its edges and heights [pixels]."""
+
+    def highest(left: float, right: float) -> float:
+        first, last = np.searchsorted(sides, [left, right])
+        return float(tops[max(first - 1, 0) : max(last, 1)].max(initial=0.0))
+
+    return highest
+
+
 def place_above(
     peaks: Floats,
     sizes: Floats,

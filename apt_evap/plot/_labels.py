@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.text import Text
 from matplotlib.transforms import IdentityTransform
 
-from apt_evap._common.label_places import Box, end_of_line, place_above
+from apt_evap._common.label_places import Box, end_of_line, outline, place_above
 from apt_evap._common.types import Floats
 
 _WITHOUT_LINE = 8.0  # pixels between a peak and its label
@@ -82,18 +82,13 @@ def label_peaks(
         to_pixels = ax.transData.transform
         sides = to_pixels(np.column_stack([edges, np.full(len(edges), heights[0])]))[:, 0]
         tops = to_pixels(np.column_stack([edges[:-1], heights]))[:, 1]
-
-        def highest(left, right):
-            first, last = np.searchsorted(sides, [left, right])
-            return tops[max(first - 1, 0) : max(last, 1)].max(initial=0.0)
-
         peaks = to_pixels([text.xy for text in texts]).reshape(-1, 2)
         others = [box_of(ax.legend_, renderer)] if ax.legend_ is not None else []
         for line in ax.lines:
             if line.get_marker() not in ("None", "", None):
                 half = 0.6 * line.get_markersize() * ax.figure.dpi / 72
                 others += [(x - half, y - half, x + half, y + half) for x, y in to_pixels(line.get_xydata())]
-        placed = place_above(peaks, sizes_of(texts, renderer), box_of(ax, renderer), highest, others)
+        placed = place_above(peaks, sizes_of(texts, renderer), box_of(ax, renderer), outline(sides, tops), others)
         for text, boxes in zip(texts, placed, strict=True):
             place_text(text, boxes)
         lines.set_segments([_line(boxes, peak) for boxes, peak in zip(placed, peaks, strict=True)])
