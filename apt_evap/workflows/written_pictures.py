@@ -3,7 +3,7 @@
 import io
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,16 @@ def save_picture(
     crystal: tuple[Orientation, Projection] | None = None,
     *,
     width: float | None = None,
+    phases: Sequence[Mapping[str, DetectorMap]] = (),
     **colors: Any,
 ) -> None:
     """Draw maps side by side into a file, perhaps with the poles of a crystal.
 
-    With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
+    With a width [mm] the figure is one of a paper, without titles and outlines of `phase_maps`. `colors` are
+    ``colormap`` and ``label``.
     """
     from apt_evap.detection.color_limits import common_limits  # with Matplotlib
+    from apt_evap.plot.phase_outlines import phase_outlines
     from apt_evap.plot.pole_labels import legend_of_poles
 
     if width is None:
@@ -56,6 +59,8 @@ def save_picture(
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
         if width is None:
             legend_of_poles(list(axes))
+    if phases and width is None:
+        phase_outlines(list(axes), maps, phases)
     save_figure(path, axes[0].figure)
 
 

@@ -803,7 +803,7 @@ def test_strays_are_counted_as_by_the_shell_and_told_on_the_page(tmp_path, monke
     x[7], y[7] = -500.0, 500.0
     mass = rng.choice([62.93, 64.93, 13.988], n, p=[0.5, 0.22, 0.28]) * rng.normal(1.0, 3e-4, n)
     mass[7] = 62.93
-    ae.write("ions.epos", ae.Hits(x=x, y=y, mass_to_charge=mass, voltage=np.full(n, 5e3)))
+    ae.write("ions.epos", ae.Hits(x=x, y=y, mass_to_charge=mass, voltage=np.full(n, 5e3), pulse_id=np.arange(n)))
     with pytest.warns(ae.warnings.DataWarning, match="far outside"):
         explorer, _ = explorer_and_view(make_parser().parse_args(["explore", "ions.epos"]))
     opened = Opened(explorer)
