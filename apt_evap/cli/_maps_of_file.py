@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import blocks_of, file_of, in_real_units, note, read
@@ -52,7 +54,10 @@ def maps_of_file(
         maps, titles = [content.smoothed(sigma)], [Path(options.file).name]
     else:
         selection = file_of(options).ions_of_map(content, note)
-        part = f", {len(selection):,} of {len(content):,} ions" if len(selection) < len(content) else ""
+        part = ""
+        if len(selection) < len(content):
+            chosen, every = (int(np.count_nonzero(ions.detected)) for ions in (selection, content))  # without strays
+            part = f", {chosen:,} of {every:,} ions"
         maps = [binned(selection, options.bins, options.smooth)]
         titles = [f"{Path(options.file).name}{_species(options)}{part}"]
         content = selection

@@ -49,6 +49,17 @@ def box_of(artist: Any, renderer: Any) -> Box:
     return artist.get_window_extent(renderer).extents
 
 
+def legend_below(axes: Sequence[Axes]) -> None:
+    """Draw one legend of all that has a label on several maps, below them."""
+    handles: dict[str, Any] = {}
+    for ax in axes:
+        handles |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    if handles:
+        options = {"facecolor": "0.2", "edgecolor": "none", "framealpha": 1, "labelcolor": "white"}  # as on a map
+        columns = min(len(handles), 4) if len(axes) > 1 else 1
+        axes[0].figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, **options)
+
+
 def label_peaks(
     ax: Axes,
     labels: Sequence[tuple[str, tuple[float, float], Any]],

@@ -9,8 +9,9 @@ from apt_evap._common.validation import check_count, check_kind
 from apt_evap.detection.color_limits import common_limits
 from apt_evap.maps.indexing.index_map import SHOWN, Indexing
 from apt_evap.plot._figure import add_colorbar, new_figure, with_default_settings
+from apt_evap.plot._labels import legend_below
 from apt_evap.plot.map_figures import color_limits, detector_map, wrapped
-from apt_evap.plot.pole_labels import legend_of_poles, poles
+from apt_evap.plot.pole_labels import poles
 
 _CHARACTERS = 12  # of the title of the figure, per inch
 _IN_TITLE = 36  # characters in a line of the title of a map
@@ -73,5 +74,5 @@ def indexing(result: Indexing, *, candidates: int | None = None) -> NDArray[np.o
     axes[0].set_title("map", fontsize="small")
     add_colorbar([ax.images[0] for ax in observed], observed)
     add_colorbar([ax.images[0] for ax in patterns], list(patterns), "predicted hits per area / mean")
-    legend_of_poles(observed)
+    legend_below(observed)
     return axes

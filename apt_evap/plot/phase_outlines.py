@@ -1,11 +1,9 @@
 """Outlines of the ions of phases over detector maps: where a feature is that is a dark or bright spot."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from scipy.ndimage import binary_fill_holes
 
@@ -15,14 +13,14 @@ from apt_evap.plot._figure import with_default_settings
 _PART = 0.9  # of the ions of a phase inside its outline
 _LARGEST = 0.5  # of the area of all ions: a larger phase has no place of its own
 _ABOVE = 1.0001  # times the level, in a hole
-_COLORS = ("#35b6ff", "#7be07b", "#e58cff", "#ffffff")
+_COLORS = ("#00ffcc", "#ff7bd5", "#ffffff")  # not those of zone lines
 
 
 @with_default_settings
 def phase_outlines(
     axes: Sequence[Axes], maps: Sequence[DetectorMap], phases: Sequence[Mapping[str, DetectorMap]]
 ) -> None:
-    """Draw the outline of 90 % of the ions of each phase over maps, with one legend.
+    """Draw the outline of 90 % of the ions of each phase over maps, with a label for a legend.
 
     A phase whose ions are all over the map, such as layers along the axis, is left out.
 
@@ -35,7 +33,6 @@ def phase_outlines(
     phases : sequence of mapping
         For each map the maps of the ions of phases, by their names, with the same bins.
     """
-    handles: dict[str, Any] = {}
     names = list(dict.fromkeys(name for parts in phases for name in parts))
     for ax, whole, parts in zip(axes, maps, phases, strict=True):
         for name, part in parts.items():
@@ -47,10 +44,7 @@ def phase_outlines(
             filled = np.where(inside, np.maximum(part.values, level * _ABOVE), np.where(part.mask, part.values, 0))
             lines = ax.contour(*part.centres, filled, [level], colors=color, linewidths=1.4)
             lines.set_path_effects([withStroke(linewidth=2.6, foreground="black")])
-            handles[name] = Line2D([], [], color=color, label=f"{_PART:.0%} of the ions of the phase {name}")
-    if handles:
-        options = {"facecolor": "0.2", "edgecolor": "none", "framealpha": 1, "labelcolor": "white"}  # as on a map
-        axes[0].figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=len(axes), **options)
+            ax.plot([], [], color=color, label=f"{_PART:.0%} of the ions of the phase {name}")
 
 
 def _level(map):

@@ -104,16 +104,6 @@ def poles(
     return ax
 
 
-def legend_of_poles(axes: Sequence[Axes]) -> None:
-    """Draw one legend of the poles and zone lines of maps, below them."""
-    handles: dict[str, Any] = {}
-    for ax in axes:
-        handles |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    if handles:
-        options = {"facecolor": "0.2", "edgecolor": "none", "framealpha": 1, "labelcolor": "white"}  # as on a map
-        axes[0].figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, **options)
-
-
 def _place_labels(ax, texts, radii, renderer):
     """Place labels beside their poles, those of the largest spacings first."""
     point = ax.figure.dpi / 72

@@ -47,8 +47,8 @@ def save_picture(
     ``colormap`` and ``label``.
     """
     from apt_evap.detection.color_limits import common_limits  # with Matplotlib
+    from apt_evap.plot._labels import legend_below
     from apt_evap.plot.phase_outlines import phase_outlines
-    from apt_evap.plot.pole_labels import legend_of_poles
 
     if width is None:
         axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title, **colors)
@@ -57,10 +57,10 @@ def save_picture(
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
-        if width is None:
-            legend_of_poles(list(axes))
-    if phases and width is None:
-        phase_outlines(list(axes), maps, phases)
+    if width is None:
+        if phases:
+            phase_outlines(list(axes), maps, phases)
+        legend_below(list(axes))
     save_figure(path, axes[0].figure)
 
 

@@ -3,6 +3,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap import plot
+from apt_evap.plot._labels import legend_below
 from apt_evap.plot.phase_outlines import phase_outlines
 from apt_evap.simulation.config.map_panels import MapSettings, Panel
 from apt_evap.workflows.maps_of_run import phase_maps, run_maps
@@ -27,6 +28,7 @@ def test_an_outline_holds_nine_of_ten_ions_and_is_named(maps):
     whole, spot, places = maps
     axes = list(plot.detector_maps([whole, whole]))
     phase_outlines(axes, [whole, whole], [{"particle": spot, "matrix": whole}, {"particle": spot}])
+    legend_below(axes)
     (legend,) = axes[0].figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["90% of the ions of the phase particle"]
     for ax in axes:
@@ -45,6 +47,7 @@ def test_without_phases_there_is_no_legend(maps):
     whole, _, _ = maps
     axes = list(plot.detector_maps([whole]))
     phase_outlines(axes, [whole], [{"matrix": whole}])
+    legend_below(axes)
     assert not axes[0].figure.legends and not lines_of(axes[0])
 
 

@@ -3,7 +3,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import ZONES, poles, zones
-from apt_evap.plot.pole_labels import legend_of_poles
+from apt_evap.plot._labels import legend_below
 
 
 @pytest.fixture
@@ -71,7 +71,7 @@ def test_one_legend_names_the_zone_lines_that_are_seen(drawn):
     other = ae.plot.detector_map(map, ax.figure.add_subplot())
     for each, families in ((ax, [(1, 1, 0)]), (other, [(1, 1, 0), (1, 0, 0)])):
         ae.plot.poles(each, ae.Orientation("Ni", (1, 1, 1)), ae.detection.Projection(12.0), zone_families=families)
-    legend_of_poles([ax, other])
+    legend_below([ax, other])
     (legend,) = ax.figure.legends
     names = [text.get_text() for text in legend.get_texts()]
     assert sorted(names) == ["poles", "zone lines of ⟨$100$⟩", "zone lines of ⟨$110$⟩"]
