@@ -90,6 +90,11 @@ def theme(style: str) -> Theme:
                     "major_label_text_color": c["ink"],
                     "title_text_font_style": "normal",
                 },
+                "ScaleBar": {
+                    "bar_line_color": c["ink"],
+                    "label_text_color": c["ink"],
+                    "label_text_font_size": "12px",
+                },
                 "Legend": {
                     "background_fill_color": c["panel"],
                     "label_text_color": c["ink"],

@@ -863,6 +863,14 @@ def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
+def test_pictures_of_atoms_have_a_scale(opened):
+    """A bar in nanometres, of the range in which positions are drawn."""
+    panels = opened.page.specimen.view, opened.page.reconstruction.view, opened.page.reconstruction.truth
+    for view in panels:
+        (bar,) = [model for model in view.figure.below + view.figure.center if model.__class__.__name__ == "ScaleBar"]
+        assert bar.unit == "nm" and bar.range is view.figure.x_range
+
+
 def test_ions_are_reconstructed_beside_the_truth(run):
     """The positions are those of `reconstruct`; the true sites turn with them; errors are told."""
     opened = Opened(Explorer(run))
