@@ -11,12 +11,12 @@ Box = tuple[float, float, float, float]
 _GAP = 3.0  # between a curve and its label
 _LINE = 1.0  # half width of the line from a peak to its label
 _STEPS = 16  # half heights of a label, by which it rises at most
-_TRIES = 8  # orders of the labels
+_TRIES = 40  # orders of the labels
 _IN_THE_WAY = 3.0  # heights of a label that its place is worse for each other peak that it hides
 
 
 def place_labels(
-    options: Sequence[Iterable[Sequence[Box]]], area: Box, taken: Iterable[Box] = ()
+    options: Sequence[Sequence[Sequence[Box]]], area: Box, taken: Iterable[Box] = ()
 ) -> list[Sequence[Box] | None]:
     """First free option of each label, the most important label first; None for a label without a free one.
 
@@ -29,17 +29,27 @@ def place_labels(
     taken : iterable of tuple of float
         Boxes of what is drawn already.
     """
-    covered = np.array(list(taken), dtype=float).reshape(-1, 4)
-    placed: list[Sequence[Box] | None] = []
-    for boxes_of_options in options:
+    arrays = [np.array(list(each), dtype=float) for each in options]  # (options, boxes, 4)
+    return _placed(options, arrays, area, np.array(list(taken), dtype=float).reshape(-1, 4))
+
+
+def _placed(options, arrays, area, covered):
+    """The same, of options that are also arrays, and of boxes of what is drawn already as an array."""
+    placed = []
+    for each, boxes in zip(options, arrays, strict=True):
         placed.append(None)
-        for boxes in boxes_of_options:
-            left, bottom, right, top = boxes[0]
-            inside = left >= area[0] and bottom >= area[1] and right <= area[2] and top <= area[3]
-            if inside and not any(_overlaps(box, covered) for box in boxes):
-                covered = np.concatenate([covered, np.array(boxes)])
-                placed[-1] = boxes
-                break
+        if not len(boxes):
+            continue
+        left, bottom, right, top = boxes[:, 0].T
+        free = (left >= area[0]) & (bottom >= area[1]) & (right <= area[2]) & (top <= area[3])
+        box, other = boxes[:, :, None], covered
+        overlap = (box[..., 0] < other[:, 2]) & (other[:, 0] < box[..., 2])
+        overlap &= (box[..., 1] < other[:, 3]) & (other[:, 1] < box[..., 3])
+        free &= ~overlap.any(axis=(1, 2))
+        if free.any():
+            first = int(np.argmax(free))
+            covered = np.concatenate([covered, boxes[first]])
+            placed[-1] = each[first]
     return placed
 
 
@@ -79,10 +89,11 @@ def place_above(
         _above(peak, size, np.delete(peaks[:, 0], number), area, highest)
         for number, (peak, size) in enumerate(zip(peaks, sizes, strict=True))
     ]
-    obstacles, order = list(taken), list(range(len(options)))
+    arrays, covered = [np.array(each) for each in options], np.array(list(taken), dtype=float).reshape(-1, 4)
+    order = list(range(len(options)))
     best: list[Sequence[Box] | None] = []
     for _ in range(_TRIES):
-        in_order = place_labels([options[number] for number in order], area, obstacles)
+        in_order = _placed([options[number] for number in order], [arrays[number] for number in order], area, covered)
         placed = [boxes for _, boxes in sorted(zip(order, in_order, strict=True), key=lambda pair: pair[0])]
         if not best or [boxes is not None for boxes in placed] > [boxes is not None for boxes in best]:
             best = placed
@@ -116,8 +127,3 @@ def _above(peak, size, others, area, highest):
 def end_of_line(peak: Sequence[float], text: Box) -> tuple[float, float]:
     """End of a line from a peak to its label."""
     return min(max(peak[0], text[0]), text[2]), text[1]
-
-
-def _overlaps(box, boxes):
-    left, bottom, right, top = boxes.T
-    return np.any((box[0] < right) & (left < box[2]) & (box[1] < top) & (bottom < box[3]))

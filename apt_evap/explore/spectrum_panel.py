@@ -105,8 +105,8 @@ class SpectrumPanel:
         self.counts = ColumnDataSource({"x": [], "y": []})
         self.background = ColumnDataSource({"x": [], "y": []})
         self.labels = ColumnDataSource({name: [] for name in ("x", "y", "label", "color", "peak_x", "peak_y", "end_x")})
-        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.25,
-                         line_color="color", line_alpha=0.4)  # fmt: skip
+        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.2,
+                         line_color="color", line_alpha=0.2)  # fmt: skip
         self.figure.step("x", "y", source=self.counts, mode="after", line_color=_CURVE)
         self.figure.line("x", "y", source=self.background, line_color=_CURVE, line_dash="dashed")
         self.figure.add_layout(

@@ -862,7 +862,6 @@ def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
     page.close()
 
 
-@pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
 def test_pictures_of_atoms_have_a_scale(opened):
     """A bar in nanometres, of the range in which positions are drawn."""
     panels = opened.page.specimen.view, opened.page.reconstruction.view, opened.page.reconstruction.truth
@@ -871,6 +870,7 @@ def test_pictures_of_atoms_have_a_scale(opened):
         assert bar.unit == "nm" and bar.range is view.figure.x_range
 
 
+@pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")
 def test_ions_are_reconstructed_beside_the_truth(run):
     """The positions are those of `reconstruct`; the true sites turn with them; errors are told."""
     opened = Opened(Explorer(run))
