@@ -90,18 +90,22 @@ def place_above(
         for number, (peak, size) in enumerate(zip(peaks, sizes, strict=True))
     ]
     arrays, covered = [np.array(each) for each in options], np.array(list(taken), dtype=float).reshape(-1, 4)
-    order = list(range(len(options)))
+    numbers = list(range(len(options)))
+    # labels of near peaks often find places like stairs
+    orders = [numbers, sorted(numbers, key=lambda k: -peaks[k, 0]), sorted(numbers, key=lambda k: peaks[k, 0])]
     best: list[Sequence[Box] | None] = []
     for _ in range(_TRIES):
-        in_order = _placed([options[number] for number in order], [arrays[number] for number in order], area, covered)
+        if not orders:
+            break
+        order = orders.pop(0)
+        in_order = _placed([options[k] for k in order], [arrays[k] for k in order], area, covered)
         placed = [boxes for _, boxes in sorted(zip(order, in_order, strict=True), key=lambda pair: pair[0])]
         if not best or [boxes is not None for boxes in placed] > [boxes is not None for boxes in best]:
             best = placed
-        if None not in placed:
-            break
-        left_out = placed.index(None)  # the most important one: it is placed first now
-        order.remove(left_out)
-        order.insert(0, left_out)
+            left_out = [k for k in numbers if placed[k] is None]
+            if not left_out:
+                break
+            orders += [[k, *(other for other in order if other != k)] for k in left_out]  # each of them first
     return best
 
 

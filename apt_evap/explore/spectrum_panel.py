@@ -39,6 +39,7 @@ from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
 _LEAST = 0.5  # ions, of the lowest line of a logarithmic scale
+_BEYOND = 1.1  # times the mass of the last peak, at the end of the axis
 _HEADROOM = 20.0  # times the highest peak, for two rows of labels
 _INNER = {"inner_width": 280.0, "inner_height": 200.0}  # px of the frame, before the browser has told them
 _LINE = 17.0  # px, height of a label of 13 px
@@ -218,7 +219,8 @@ class SpectrumPanel:
         mass = self.named.hits.mass_to_charge
         mass = mass[np.isfinite(mass) & (mass > 0)]
         intervals = [interval for ion in self.named.ions for interval in ion.intervals]
-        last = max([1.5 * high for _, high in intervals], default=float(np.percentile(mass, 99)))
+        ends = [high for _, high in intervals] + [peak.mass for peak in self.named.unexplained]
+        last = _BEYOND * max(ends, default=float(np.percentile(mass, 99)))
         count, edges = np.histogram(mass, np.linspace(0.0, last, _BINS + 1))
         self.counts.data = {"x": edges[:-1], "y": np.maximum(count, _LEAST)}
         coarse = edges[::20]
