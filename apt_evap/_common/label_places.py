@@ -115,7 +115,7 @@ def _above(peak, size, others, area, highest):
     options = []
     for shift in (-0.5, 0.0, -1.0, 0.5, -1.5):
         left = min(max(x + shift * width, area[0]), area[2] - width)
-        hidden = np.count_nonzero((others > left - _GAP) & (others < left + width + _GAP))
+        hidden = np.count_nonzero((others > left - _LINE) & (others < left + width + _LINE))
         worse = (_IN_THE_WAY * hidden + abs(shift + 0.5)) * height
         lowest = max(highest(left, left + width), y) + _GAP
         for bottom in lowest + 0.5 * height * np.arange(_STEPS):
