@@ -478,7 +478,6 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
-@pytest.mark.slow
 def test_a_candidate_is_drawn_inside_the_map_and_its_handles_where_they_can_be_dragged(run):
     x, y = np.meshgrid(*[np.linspace(-39, 39, 40)] * 2)
     edges = np.linspace(-40, 40, 41)
@@ -503,6 +502,7 @@ def test_a_candidate_is_drawn_inside_the_map_and_its_handles_where_they_can_be_d
     both.close()
 
 
+@pytest.mark.slow
 def test_a_fit_of_earlier_marks_is_not_shown(measured):
     """Marks are faster than fits: what is shown is the fit of all marks, or of none."""
     opened = Opened(Explorer(None, measured))
