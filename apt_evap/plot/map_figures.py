@@ -266,7 +266,7 @@ def describe(map: DetectorMap) -> str:
     return ", ".join(parts)
 
 
-def wrapped(text, width):
+def wrapped(text: str, width: int) -> str:
     """Break text into lines, at commas if possible."""
     unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
     lines = "\n".join(
