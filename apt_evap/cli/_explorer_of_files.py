@@ -1,6 +1,7 @@
 """Explorer of the files of `apt-evap explore`, by its options, and the same as text."""
 
 import argparse
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.codec import declared, to_python
+from apt_evap._common.recorded_warnings import recorded_warnings
 from apt_evap.cli._files import file_of, in_real_units, lens_of, read, read_registration
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.controls import values_of
@@ -22,12 +24,15 @@ from apt_evap.simulation.config.simulation_file import read_config
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.materials import MATERIALS
+from apt_evap.warnings import DataWarning
 
 
-def with_file(options: argparse.Namespace, path: str) -> tuple[Explorer | None, ExplorerSettings | None]:
-    """Explorer and view with one more file: a run replaces the run, anything else the measurement."""
+def with_file(options: argparse.Namespace, path: str | None) -> tuple[Explorer | None, ExplorerSettings | None]:
+    """Explorer and view with one more file: a run replaces the run, anything else the measurement; None closes both."""
     changes: dict[str, Any] = {"registration": None, "simulated": None}
-    if _run_in(path) is not None:
+    if path is None:
+        changes |= {"run": None, "file": None}
+    elif _run_in(path) is not None:
         changes["run"] = path
     else:
         changes |= dict.fromkeys((*declared(MeasuredFile), "element"))
@@ -47,7 +52,19 @@ def _run_in(path):
 
 
 def explorer_and_view(options: argparse.Namespace) -> tuple[Explorer | None, ExplorerSettings | None]:
-    """Explorer of the files of the command, and the view of its options; None without a file."""
+    """Explorer of the files of the command, and the view of its options; None without a file.
+
+    Warnings of the files are also notes of the explorer.
+    """
+    with warnings.catch_warnings(), recorded_warnings() as messages:
+        warnings.simplefilter("always", DataWarning)  # also of a file that is opened again
+        explorer, view = _explorer_and_view(options)
+    if explorer is not None:
+        explorer.notes = tuple(dict.fromkeys(map(str, messages)))
+    return explorer, view
+
+
+def _explorer_and_view(options):
     run = None if options.run is None else _run_in(options.run)
     if options.run is not None and run is None:
         if options.file is not None:

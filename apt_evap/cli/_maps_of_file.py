@@ -5,6 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apt_evap.analysis.apex import image_compression
 from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import blocks_of, file_of, in_real_units, note, read
@@ -19,22 +21,27 @@ from apt_evap.simulation.config.material_text import read_material
 from apt_evap.simulation.config.perturbation_text import read_perturbation
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
-from apt_evap.workflows.maps_of_run import run_maps, settings_of_maps
+from apt_evap.workflows.maps_of_run import phase_maps, run_maps, settings_of_maps
 
 _IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 bins wide
 
 
-def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[str], str | None, Any]:
-    """Maps of the file of a command, their titles, the title of their picture, and the crystal whose poles it has."""
+def maps_of_file(
+    options: argparse.Namespace,
+) -> tuple[list[DetectorMap], list[str], str | None, Any, list[dict[str, DetectorMap]]]:
+    """Maps of the file of a command, their titles, title and crystal of their picture, and maps of phases of a run."""
     if (ready := _map_of_large_file(options)) is not None:
-        return [ready], [Path(options.file).name], None, None
+        return [ready], [Path(options.file).name], None, None, []
     content = read(options)
     title = crystal = None
+    phases: list[dict[str, DetectorMap]] = []
     if options.field_ion is not None:
         maps, titles = _field_ion_map(content, options)
     elif isinstance(content, Run):
         content = in_real_units(content, options)
-        maps, titles = run_maps(content, _map_settings(content, options), file_of(options).of_run().select)
+        settings, choose = _map_settings(content, options), file_of(options).of_run().select
+        maps, titles = run_maps(content, settings, choose)
+        phases = phase_maps(content, maps, settings, choose)
         titles = [f"{name}{_species(options)}" for name in titles]
     elif options.perturbation or options.real_units or options.lens:
         what = "a map" if isinstance(content, DetectorMap) else "measured ions"
@@ -47,7 +54,10 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
         maps, titles = [content.smoothed(sigma)], [Path(options.file).name]
     else:
         selection = file_of(options).ions_of_map(content, note)
-        part = f", {len(selection):,} of {len(content):,} ions" if len(selection) < len(content) else ""
+        part = ""
+        if len(selection) < len(content):
+            chosen, every = (int(np.count_nonzero(ions.detected)) for ions in (selection, content))  # without strays
+            part = f", {chosen:,} of {every:,} ions"
         maps = [binned(selection, options.bins, options.smooth)]
         titles = [f"{Path(options.file).name}{_species(options)}{part}"]
         content = selection
@@ -57,7 +67,7 @@ def maps_of_file(options: argparse.Namespace) -> tuple[list[DetectorMap], list[s
         title, crystal = _crystal(content, options, title)
     elif options.axis or options.rotation is not None or options.scale is not None:
         raise ValueError("--axis, --rotation and --scale are for --poles")
-    return maps, titles, title, crystal
+    return maps, titles, title, crystal, phases
 
 
 def _map_of_large_file(options):

@@ -89,10 +89,10 @@ def _option(text: str) -> tuple[str, tuple[float, ...]]:
 def execute(options: argparse.Namespace) -> int:
     """Run the command."""
     from apt_evap._common.codec import declared
+    from apt_evap._common.recorded_warnings import recorded_warnings
     from apt_evap.cli._files import read_registration
     from apt_evap.fit.fit_settings import FitSettings
     from apt_evap.fit.grid import EnergyGrid
-    from apt_evap.plot.report.origin import recorded_warnings
     from apt_evap.workflows.compare_maps import IN_LINES, compare
     from apt_evap.workflows.measured_source import MeasuredSource
 

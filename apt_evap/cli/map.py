@@ -104,8 +104,9 @@ def execute(options: argparse.Namespace) -> int:
 
     picture = picture_path(options.output or f"{Path(options.file).stem}_map.png")
     check_output(picture, is_picture, options.force)
-    maps, titles, title, crystal = maps_of_file(options)
+    maps, titles, title, crystal, phases = maps_of_file(options)
     colors = {} if options.field_ion is None else {"colormap": "gray", "label": "brightness / mean"}
-    tell(options, save_picture(picture, maps, titles, title, crystal, width=options.width, **colors))
+    written = save_picture(picture, maps, titles, title, crystal, width=options.width, phases=phases, **colors)
+    tell(options, written)
     tell_json(options, {"wrote": str(picture), "file": options.file, "maps": map_summaries(maps, titles)})
     return 0

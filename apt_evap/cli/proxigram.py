@@ -38,7 +38,7 @@ def execute(options: argparse.Namespace) -> int:
     cloud, solute, picture = read_cloud(options, "proxigram")
     lengths = {name: getattr(options, name) for name in _LENGTHS if getattr(options, name) is not None}
     profile = cloud.proxigram(solute, options.isovalue, largest=options.largest, **lengths)
-    title = f"{', '.join(solute)} at {100 * options.isovalue:g} %, {profile.area:.3g} nm^2"
+    title = f"{', '.join(solute)} at {100 * options.isovalue:g} %, {profile.area:.3g} nm²"
     done = save_figure(picture, plot.composition_profile(profile, title=title).figure)
     tell(options, f"{cloud!r}")
     tell(options, f"isosurface of {profile.area:.4g} nm^2")

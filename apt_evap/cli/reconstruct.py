@@ -134,9 +134,10 @@ def execute(options: argparse.Namespace) -> int:
     figure, done = None, f"no picture of fewer than {FEWEST} ions"
     if options.picture is not None or len(reconstruction) >= FEWEST:
         if isinstance(reconstruction, EvolvingReconstruction) and reconstruction.history is not None:
-            figure = plot.surface_history(reconstruction, ranges)[0].figure
+            title = f"{Path(options.file).name}: {reconstruction.verdict}"
+            figure = plot.surface_history(reconstruction, ranges, title=title)[0].figure
         else:
-            figure = plot.reconstruction(reconstruction, ranges)[0].figure
+            figure = plot.reconstruction(reconstruction, ranges, title=Path(options.file).name)[0].figure
     write(output, reconstruction.to_hits(options.frame))
     tell(options, f"{reconstruction!r}")
     assumed = assumptions(reconstruction, [name for name in _ASSUMED if name not in settings])

@@ -103,6 +103,8 @@ class Explorer:
         """Name of the crystal of the measurement, if it is known and one of the table."""
         self.crystal_of_ions = ""
         """Element of most of the measured ions by their masses, if the spectrum has named them."""
+        self.notes: tuple[str, ...] = ()
+        """Texts of the warnings of reading the files."""
         self.poles: Any = None if run is None else PolesOfRun(run)
         self.search: Any = None if run is None else RegistrationSearch(run)
         if run is not None and measured is not None and registration is None:

@@ -19,7 +19,7 @@ class FilePanel:
 
     def __init__(
         self,
-        read: Callable[[str], Callable[[], None]] | None,
+        read: Callable[[str | None], Callable[[], None]] | None,
         close: Callable[[], None],
         note: Callable[[str], None],
         later: Callable[[Callable[[], None], int], Any],
@@ -39,11 +39,18 @@ class FilePanel:
         self.dropped = TextInput(visible=False, name=DROPPED)
         self.dropped.on_change("value", lambda attr, old, new: self._open_dropped(new))
 
+    def close_all(self) -> None:
+        """Go back to the page without a file."""
+        self._open(None)
+
     def open(self, path: str) -> None:
         """Read a file in a thread, and make the page again; only what cannot be read leaves the page."""
+        self._note(f"reading {path}")
+        self._open(path)
+
+    def _open(self, path):
         assert self._read is not None
         read = self._read
-        self._note(f"reading {path}")
 
         def work():
             make_page = read(path)

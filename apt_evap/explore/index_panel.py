@@ -30,7 +30,7 @@ from apt_evap.detection.projection import Projection
 from apt_evap.explore.marks import Marks, overlay
 from apt_evap.explore.mouse_tools import MouseTool
 from apt_evap.explore.newest_task import NewestTaskRunner
-from apt_evap.explore.pole_panel import draw_poles, sparse_labels, with_gaps
+from apt_evap.explore.pole_panel import ZONE_LINE, draw_poles, sparse_labels, with_gaps
 from apt_evap.explore.search_process import SearchProcess, guarded, start_thread
 from apt_evap.explore.widgets import LEFT, progress_text
 from apt_evap.fit.measured_map import measured_map
@@ -41,6 +41,10 @@ from apt_evap.specimen.materials import MATERIALS
 
 HINT = "mode “pole”: click a pole whose family you choose here; drag a mark to move it"
 MOVED = "moved by hand"
+_LEGEND = (
+    f'<span style="color: {ZONE_LINE}">—</span> zone lines, ○ poles, as the candidate predicts them; in the mode “pole”'
+    " the orange dots shift (left), turn and scale it (right)"
+)
 _OTHER_IONS = "the ions have changed: search again"
 _REACH = 0.3  # distance between both handles, as a fraction of the width of the map
 # Rotation, scale and centre of the handles move the overlay. Python computes it when the mouse is released.
@@ -195,14 +199,16 @@ class IndexPanel:
         self.handles.on_change("data", lambda attr, old, new: self._dragged())
         self.tool = PointDrawTool(renderers=[drawn, held], add=False)
         fig.add_tools(self.tool)
-        self._drawings += [held, between]
+        self._handles = [held, between]
         self.marks.on_change("data", lambda attr, old, new: self.fit())
         self._line = 1
 
-    def show_overlay(self, shown: bool) -> None:
-        """Show or hide the candidate on the map; the marks stay."""
+    def show_overlay(self, shown: bool, handles: bool) -> None:
+        """Show or hide the candidate on the map, and the handles that move it; the marks stay."""
         for drawing in self._drawings:
             drawing.visible = shown
+        for drawing in self._handles:
+            drawing.visible = shown and handles
 
     # ---- marks -----------------------------------------------------------------------------------------------------
 
@@ -302,7 +308,10 @@ class IndexPanel:
             options["scales"] = (0.95 * self.scale.value, 1.05 * self.scale.value)
         else:
             options["distance"] = self._distance()
-        arguments = self._measured(), self.material.value
+        measured = self._measured()
+        if isinstance(measured, Hits):
+            measured = measured[measured.detected]  # without strays, which the other process would look for again
+        arguments = measured, self.material.value
         label = button.label
         for search_button in (self.search, self.refine):
             search_button.disabled = True
@@ -335,7 +344,8 @@ class IndexPanel:
             with SearchProcess() as process:
                 self._process = process
                 indexing = process.call(index, arguments, options, progress)
-            self._later(partial(put, indexing, f"{indexing.verdict}: {indexing.reason}"), 0)
+                notes = process.notes
+            self._later(partial(put, indexing, "; ".join([f"{indexing.verdict}: {indexing.reason}", *notes])), 0)
 
         start_thread(work, lambda sentence: self._later(partial(put, None, sentence), 0))
 
@@ -432,7 +442,7 @@ class IndexPanel:
         axis = ", ".join(f"{component:.3f}" for component in orientation.axis)
         self.text.text = (
             f"<b>{quality}</b>, scale {projection.scale:.1f} mm/rad<br>axis [{axis}], rotation "
-            f"{orientation.rotation:.2f}°<br>{self._hint}"
+            f"{orientation.rotation:.2f}°<br>{self._hint}<br>{_LEGEND}"
         )
         self._put_code(
             f"import apt_evap as ae\n\norientation = {to_python(orientation)}\nprojection = ae.detection.{projection!r}"

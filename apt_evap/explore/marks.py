@@ -25,7 +25,7 @@ _AZIMUTHS = np.radians(np.arange(0.0, 361.0, 2.0))
 
 
 class Overlay(NamedTuple):
-    """Poles and zone lines of an orientation on a map."""
+    """Poles and zone lines of an orientation within the field of view of a map."""
 
     places: Floats
     """Positions of the poles [mm], shape (n, 2)."""
@@ -150,15 +150,12 @@ def overlay(
     like: DetectorMap,
     families: int = FAMILIES,
 ) -> Overlay:
-    """Poles and zone lines of an orientation on a map."""
-    left, right, lower, upper = like.extent
+    """Poles and zone lines of an orientation within the field of view of a map."""
     crystal = poles(orientation.material, families)
 
     def places_of(directions):
         places = projection.places(directions)
-        with np.errstate(invalid="ignore"):
-            outside = (places < (left, lower)).any(axis=1) | (places > (right, upper)).any(axis=1)
-        places[outside] = np.nan
+        places[~like.contains(*places.T)] = np.nan
         return places
 
     places = places_of(orientation.directions(crystal.normals))

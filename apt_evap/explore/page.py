@@ -71,7 +71,7 @@ class Page:
         document: Document,
         settings: ExplorerSettings | None = None,
         registration_of: Callable[[str], Registration] | None = None,
-        opened: Callable[[str, Document], Callable[[], None]] | None = None,
+        opened: Callable[[str | None, Document], Callable[[], None]] | None = None,
         later: Callable[[Callable[[], None], int], Any] | None = None,
         state: ServerState | None = None,
     ) -> None:
@@ -82,6 +82,8 @@ class Page:
         self.summary = SummaryPanel(explorer, self._later)
         read = None if opened is None else lambda path: opened(path, document)
         self.files = FilePanel(read, self.close, self.summary.note, self._later)
+        self.back = Button(label="start page", width=90, visible=opened is not None and explorer is not None)
+        self.back.on_click(self.files.close_all)
         self.style = Button(label=STYLES[1], width=56)
         self.style.on_click(self._next_style)
         self.registration: RegistrationPanel | None = None
@@ -172,7 +174,7 @@ class Page:
             (lambda: spectrum.named) if spectrum is not None else None, self._material, self._later,
         )  # fmt: skip
         self.tools = MouseTools(figures, tools, self.figures.show_whole)
-        if explorer.is_comparison:
+        if self.index is not None:
             self.tools.choice.on_change("active", lambda attr, old, new: self._show_candidate())
             self._show_candidate()
 
@@ -190,10 +192,11 @@ class Page:
         self.summary.put_verdict()
 
     def _show_candidate(self):
-        """Poles of the candidate while the map is indexed, else those of the run."""
+        """Poles of the candidate, beside a run only while the map is indexed: else those of the run are shown."""
         indexed = self.tools.choice.labels[self.tools.choice.active] in self.index.tools
-        self.index.show_overlay(indexed)
-        self.poles.hide_on_last(indexed)
+        self.index.show_overlay(indexed or self.poles is None, handles=indexed)
+        if self.poles is not None:
+            self.poles.hide_on_last(indexed)
 
     def _material(self):
         """Name of the crystal of the run or of the command, if it is one of the table."""
@@ -209,7 +212,7 @@ class Page:
 
     def _head(self):
         return row(
-            self.files.field, self.files.dropped, self.summary.facts, self.style,
+            self.files.field, self.files.dropped, self.back, self.summary.facts, self.style,
             sizing_mode="stretch_width", styles={"align-items": "center", "gap": "12px"},
         )  # fmt: skip
 

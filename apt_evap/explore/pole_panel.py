@@ -10,6 +10,8 @@ from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.explore.explorer import Explorer, ExplorerMaps
 from apt_evap.explore.marks import Overlay
 
+ZONE_LINE = "#35b6ff"
+"""Colour of zone lines."""
 _LABEL = (0.08, 0.04)  # width and height of a label, over the width of the map
 
 
@@ -55,7 +57,7 @@ def draw_poles(fig: Any, lines: ColumnDataSource, poles: ColumnDataSource) -> li
     )  # fmt: skip
     fig.add_layout(labels)
     return [
-        fig.line("x", "y", source=lines, line_color="#35b6ff", line_width=1, line_alpha=0.8),
+        fig.line("x", "y", source=lines, line_color=ZONE_LINE, line_width=1, line_alpha=0.8),
         fig.scatter("x", "y", source=poles, size=7, fill_alpha=0, line_color="white"),
         labels,
     ]

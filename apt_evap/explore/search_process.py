@@ -4,11 +4,13 @@ import contextlib
 import multiprocessing
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from typing import Any
 
 from apt_evap._common.validation import short_text
+from apt_evap.warnings import AptWarning
 
 
 class ProcessEnded(RuntimeError):
@@ -25,6 +27,8 @@ class SearchProcess:
         self._process.start()
         pipe.close()  # the pipe then ends with the process
         self._cancelled = False
+        self.notes: list[str] = []
+        """Texts of the warnings of the last call."""
 
     def __enter__(self) -> "SearchProcess":
         return self
@@ -48,7 +52,7 @@ class SearchProcess:
         try:
             self._pipe.send((function, arguments, dict(options), progress is not None))
             while True:
-                part, result, sentence = self._pipe.recv()
+                part, result, sentence, self.notes = self._pipe.recv()
                 if part is None:
                     break
                 if progress is not None:
@@ -68,12 +72,15 @@ def _serve(pipe):
         while True:
             function, arguments, options, tells = pipe.recv()
             if tells:
-                options["progress"] = lambda part: pipe.send((part, None, ""))
-            try:
-                reply = None, function(*arguments, **options), ""
-            except Exception as error:
-                reply = None, None, sentence_of(error)
-            pipe.send(reply)
+                options["progress"] = lambda part: pipe.send((part, None, "", []))
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", AptWarning)
+                try:
+                    result, sentence = function(*arguments, **options), ""
+                except Exception as error:
+                    result, sentence = None, sentence_of(error)
+            notes = [str(warning.message) for warning in caught if issubclass(warning.category, AptWarning)]
+            pipe.send((None, result, sentence, notes))
 
 
 def sentence_of(error: BaseException) -> str:

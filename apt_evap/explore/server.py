@@ -56,7 +56,7 @@ def serve(
     *,
     port: int = 0,
     registration_of: Callable[[str], Registration] | None = None,
-    with_file: Callable[[str], tuple[Explorer | None, ExplorerSettings | None]] | None = None,
+    with_file: Callable[[str | None], tuple[Explorer | None, ExplorerSettings | None]] | None = None,
     origins: Sequence[str] = (),
 ) -> tuple[Server, str]:
     """Make the server of a page that only the holder of its address can open, from this machine."""
@@ -76,12 +76,28 @@ def serve(
         page = Page(shown[0], document, shown[1], registration_of, None if with_file is None else opened, state=state)
         document.on_session_destroyed(lambda _: page.close())
 
-    def opened(path: str, document: Document) -> Callable[[], None]:
-        """Read a file, in any thread; the function that is returned makes the page again, in that of the document."""
+    def opened(path: str | None, document: Document) -> Callable[[], None]:
+        """Read a file, in any thread; the function that is returned makes the page again, in that of the document.
+
+        None closes the files.
+        """
         nonlocal shown
         assert with_file is not None
         if path == EXAMPLE:
             write_example()
+        if path is None:
+            shown = with_file(None)
+        else:
+            show(path)
+
+        def make_again():
+            document.clear()
+            make(document)
+
+        return make_again
+
+    def show(path):
+        nonlocal shown
         before, ranges = shown[0], path if path.lower().endswith(RANGES) else None
         if ranges is None or before is None or not isinstance(before.ions_of_file, MeasuredIons):
             path = path if ranges is None else measurement_of(path)
@@ -91,12 +107,6 @@ def serve(
                 shown[0].keep_ions(before)
         if ranges is not None and shown[0] is not None and isinstance(shown[0].ions_of_file, MeasuredIons):
             shown[0].ions_of_file.ranges = ranges
-
-        def make_again():
-            document.clear()
-            make(document)
-
-        return make_again
 
     logging.getLogger("tornado.application").addFilter(_STRANGER_FILTER)
     logging.getLogger("bokeh.server.views.ws").addFilter(_OPTION_FILTER)

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.events import Pan, PanStart
-from bokeh.models import ColumnDataSource, CustomJS, LinearColorMapper, WheelZoomTool
+from bokeh.models import ColumnDataSource, CustomJS, LinearColorMapper, ScaleBar, WheelZoomTool
 from bokeh.palettes import Viridis256
 
 from apt_evap._common.types import Floats, Integers
@@ -70,6 +70,10 @@ class SpecimenView:
         self.figure: Any = square(title, (-1, 1, -1, 1), [wheel])
         self.figure.toolbar.active_scroll = wheel
         self.figure.axis.visible = False
+        self.figure.add_layout(
+            ScaleBar(range=self.figure.x_range, unit="nm", location="bottom_left", background_fill_alpha=0,
+                     border_line_alpha=0, padding=2)
+        )  # fmt: skip
         self.figure.update(styles=self.figure.styles | {"max-width": f"{_WIDEST}px"})
         self.points = ColumnDataSource({name: [] for name in ("x", "y", "z", "color", "radius")})
         self.points.tags = list(SIDES["oblique"])

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable
 from functools import partial
 from html import escape
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from bokeh.models import (
     Div,
     LabelSet,
     NumericInput,
+    Range1d,
     RangeSlider,
     Select,
     TextInput,
@@ -24,6 +26,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
+from apt_evap._common.label_places import end_of_line, outline, place_above
 from apt_evap.explore.measured_ions import IonSelection, MeasuredIons
 from apt_evap.explore.search_process import start_thread
 from apt_evap.explore.start_page import ranges_near
@@ -35,6 +38,12 @@ from apt_evap.spectra.isotope_comb import in_intervals
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _BINS = 2000
+_LEAST = 0.5  # ions, of the lowest line of a logarithmic scale
+_BEYOND = 1.1  # times the mass of the last peak, at the end of the axis
+_HEADROOM = 20.0  # times the highest peak, for two rows of labels
+_INNER = {"inner_width": 280.0, "inner_height": 200.0}  # px of the frame, before the browser has told them
+_LINE = 17.0  # px, height of a label of 13 px
+_LABEL_DELAY = 100  # ms, in which a wheel turns on
 _REACH = 0.01  # of the shown masses, from the mouse to a peak: 3 to 8 pixels
 _COLORS = ("#4aa3ff", "#ff6b6b", "#6bd06b", "#c08bff", "#ffb04a", "#c98a6b", "#ff8fd0", "#d8d84a", "#4ad8d8")
 _CURVE = "#8298b0"  # seen in both styles
@@ -86,19 +95,26 @@ class SpectrumPanel:
         self.figure: Any = figure(
             sizing_mode="stretch_width", height=300, y_axis_type="log", tools=[wheel, drag], toolbar_location=None,
             x_axis_label="m/n [Da]", y_axis_label="ions", active_scroll=wheel, active_drag=drag, visible=False,
+            x_range=Range1d(0.0, 1.0), y_range=Range1d(_LEAST, 10.0),
         )  # fmt: skip
+        self._inner, self._labels_wait = dict(_INNER), False
+        for name in ("start", "end"):
+            self.figure.x_range.on_change(name, lambda attr, old, new: self._label_later())
+        for name in self._inner:
+            self.figure.on_change(name, lambda attr, old, new: self._resized(attr, new))
         self.ranges = ColumnDataSource({name: [] for name in ("left", "right", "top", "bottom", "color")})
         self.counts = ColumnDataSource({"x": [], "y": []})
         self.background = ColumnDataSource({"x": [], "y": []})
-        self.labels = ColumnDataSource({"x": [], "y": [], "label": [], "color": []})
-        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.25,
-                         line_color="color", line_alpha=0.4)  # fmt: skip
+        self.labels = ColumnDataSource({name: [] for name in ("x", "y", "label", "color", "peak_x", "peak_y", "end_x")})
+        self.figure.quad("left", "right", "top", "bottom", source=self.ranges, fill_color="color", fill_alpha=0.2,
+                         line_color="color", line_alpha=0.2)  # fmt: skip
         self.figure.step("x", "y", source=self.counts, mode="after", line_color=_CURVE)
         self.figure.line("x", "y", source=self.background, line_color=_CURVE, line_dash="dashed")
         self.figure.add_layout(
             LabelSet(x="x", y="y", text="label", text_color="color", source=self.labels, text_font_size="13px",
-                     y_offset=2, text_align="center")
+                     text_align="left", text_baseline="bottom")
         )  # fmt: skip
+        self.figure.segment("peak_x", "peak_y", "end_x", "y", source=self.labels, line_color="color", line_alpha=0.6)
         self.unexplained = ColumnDataSource({"x": [], "y": []})
         self.figure.scatter("x", "y", source=self.unexplained, marker="inverted_triangle", size=9, color=_UNEXPLAINED)
         self.figure.on_event(SelectionGeometry, self._dragged)
@@ -159,11 +175,11 @@ class SpectrumPanel:
 
         def work():
             named = self._ions.spectrum(elements)
-            self._later(partial(self._put, named, elements is None), 0)
+            self._later(partial(self._put, named, named.dead_time_note(), elements is None), 0)
 
         start_thread(work, lambda sentence: self._later(partial(setattr, self.text, "text", escape(sentence)), 0))
 
-    def _put(self, named, by_itself):
+    def _put(self, named, losses, by_itself):
         self.named = named
         fitted = self._ions.flight
         self.use.visible = fitted is not None and fitted[0] != self.distance.value
@@ -175,7 +191,9 @@ class SpectrumPanel:
         composed = len(str(named.composition).splitlines()) - 1
         unexplained, *parts = (escape(line) for line in str(named).splitlines()[:-composed])
         mark = f'<span style="color: {_UNEXPLAINED}">▼</span>'
-        self.composition.text = f"{mark} {unexplained}<br>{_composition_table(named.composition)}"
+        self.composition.text = (
+            f"{mark} {unexplained}<br>{_composition_table(named.composition)}<small>{escape(losses)}</small>"
+        )
         self.text.text = "<br>".join(parts)
         self.peak.text = "Click a peak to see which ions it may be; drag over peaks to see the map of their ions."
         formulas = list(dict.fromkeys(ion.formula for ion in named.ions if ion.intervals))
@@ -201,37 +219,74 @@ class SpectrumPanel:
         mass = self.named.hits.mass_to_charge
         mass = mass[np.isfinite(mass) & (mass > 0)]
         intervals = [interval for ion in self.named.ions for interval in ion.intervals]
-        last = max([1.5 * high for _, high in intervals], default=float(np.percentile(mass, 99)))
+        ends = [high for _, high in intervals] + [peak.mass for peak in self.named.unexplained]
+        last = _BEYOND * max(ends, default=float(np.percentile(mass, 99)))
         count, edges = np.histogram(mass, np.linspace(0.0, last, _BINS + 1))
-        least = 0.5
-        self.counts.data = {"x": edges[:-1], "y": np.maximum(count, least)}
+        self.counts.data = {"x": edges[:-1], "y": np.maximum(count, _LEAST)}
         coarse = edges[::20]
-        below = np.maximum(self.named.background(coarse) / 20, least)
+        below = np.maximum(self.named.background(coarse) / 20, _LEAST)
         self.background.data = {"x": (coarse[1:] + coarse[:-1]) / 2, "y": below}
-        top = float(max(count.max(), 10))
-        self.figure.y_range.update(start=least, end=6 * top)
+        top = _HEADROOM * float(max(count.max(), 10))
+        self.figure.y_range.update(start=_LEAST, end=top)
         self.figure.x_range.update(start=0.0, end=last)
-        formulas = list(dict.fromkeys(ion.formula for ion in self.named.ions))
+        self._colors = dict(zip(dict.fromkeys(ion.formula for ion in self.named.ions), cycle(_COLORS), strict=False))
         drawn: dict[str, list[Any]] = {name: [] for name in self.ranges.data}
-        labels: dict[str, list[Any]] = {name: [] for name in self.labels.data}
         for ion in self.named.ions:
-            color = _COLORS[formulas.index(ion.formula) % len(_COLORS)]
             for low, high in ion.intervals:
-                new = {"left": low, "right": high, "top": 6 * top, "bottom": least, "color": color}
+                new = {"left": low, "right": high, "top": top, "bottom": _LEAST, "color": self._colors[ion.formula]}
                 drawn = {name: [*values, new[name]] for name, values in drawn.items()}
-            if not ion.intervals:
-                continue
-            low, high = ion.intervals[0][0], ion.intervals[-1][1]
-            inside = count[(edges[1:] > low) & (edges[:-1] < high)]
-            middle = (low + high) / 2
-            if all(abs(middle - place) > 0.03 * last for place in labels["x"]):
-                new = {"x": middle, "y": float(inside.max(initial=1)), "label": ion.name, "color": color}
-                labels = {name: [*values, new[name]] for name, values in labels.items()}
-        self.ranges.data, self.labels.data = drawn, labels
+        self.ranges.data = drawn
         places = np.array([peak.mass for peak in self.named.unexplained])
         heights = count[np.clip(np.searchsorted(edges, places) - 1, 0, len(count) - 1)]
         self.unexplained.data = {"x": places, "y": 1.6 * np.maximum(heights, 1)}
         self.figure.visible = True
+        self._put_labels()
+
+    def _resized(self, side, pixels):
+        if pixels:
+            self._inner[side] = pixels
+            self._label_later()
+
+    def _label_later(self):
+        if not self._labels_wait and self.named is not None:
+            self._labels_wait = True
+            self._later(self._put_labels, _LABEL_DELAY)
+
+    def _put_labels(self):
+        """Write the names above the peaks between the masses that are shown, those of the largest first."""
+        self._labels_wait = False
+        fig, x, y = self.figure, np.asarray(self.counts.data["x"]), np.asarray(self.counts.data["y"])
+        wide, high = self._inner.values()
+        low, last = fig.x_range.start, fig.x_range.end
+        per_decade = high / np.log10(fig.y_range.end / fig.y_range.start)
+        across, up = (x - low) * wide / (last - low), per_decade * np.log10(y / fig.y_range.start)
+        peaks = []
+        for ion in self.named.ions:
+            inside = np.zeros(len(x), bool)
+            for start, end in ion.intervals:
+                inside |= (x + x[1] > max(start, low)) & (x < min(end, last))
+            if inside.any():
+                peak = np.flatnonzero(inside)[np.argmax(y[inside])]
+                peaks.append((y[peak], across[peak], up[peak], x[peak], ion.name, self._colors[ion.formula]))
+        peaks.sort(reverse=True)
+        half = 6.0  # px, of a mark
+        marks = [
+            ((at - low) * wide / (last - low), per_decade * np.log10(top / fig.y_range.start))
+            for at, top in zip(self.unexplained.data["x"], self.unexplained.data["y"], strict=True)
+        ]
+        placed = place_above(
+            np.array([peak[1:3] for peak in peaks]).reshape(-1, 2),
+            np.array([(_width_of(peak[4]), _LINE) for peak in peaks]).reshape(-1, 2),
+            (0.0, 0.0, wide, high),
+            outline(np.append(across, wide), up),
+            [(a - half, b - half, a + half, b + half) for a, b in marks],
+        )
+        rows = [
+            (low + boxes[0][0] * (last - low) / wide, fig.y_range.start * 10 ** (boxes[0][1] / per_decade),
+             peak[4], peak[5], peak[3], peak[0], low + end_of_line(peak[1:3], boxes[0])[0] * (last - low) / wide)
+            for peak, boxes in zip(peaks, placed, strict=True) if boxes is not None
+        ]  # fmt: skip
+        self.labels.data = {name: [row[k] for row in rows] for k, name in enumerate(self.labels.data)}
 
     # ---- the selection ---------------------------------------------------------------------------------------------
 
@@ -320,7 +375,7 @@ class SpectrumPanel:
 
     def _tell(self):
         selection = self._ions.selection
-        number, of = len(self._ions.hits), len(self._ions.all)
+        number, of = (int(np.count_nonzero(hits.detected)) for hits in (self._ions.hits, self._ions.all))
         intervals = self._intervals(selection.element)
         if selection.mass is not None:
             intervals = [selection.mass]
@@ -351,6 +406,11 @@ class SpectrumPanel:
             self.text.text = f"wrote {escape(str(path))}"
         except (ValueError, OSError) as error:
             self.text.text = escape(str(error))
+
+
+def _width_of(name: str) -> float:
+    """Width of the name of an ion [px], of letters and of digits and charges above and below the line."""
+    return sum(10.0 if sign.isupper() else 7.0 if sign.isalpha() else 5.2 for sign in name)
 
 
 def _composition_table(composition: Composition) -> str:

@@ -44,10 +44,10 @@ small { font-size: 12px; color: var(--faint); }
 :host(.group) .bk-btn.bk-active { box-shadow: none; }
 :host(.group) .bk-btn.bk-active::before { content: "\\25be  "; }
 :host(.tabs) .bk-btn { background: transparent; color: var(--ink); border-width: 0 0 3px 0; border-radius: 0;
-  border-color: var(--edge); padding: 6px 9px; box-shadow: none; }
+  border-color: var(--edge); padding: 6px 5px; box-shadow: none; }
 :host(.tabs) .bk-btn-group { flex-wrap: wrap; }
 :host(.tabs) .bk-btn.bk-active { background: transparent; color: var(--ink); border-color: #2f6fb3; font-weight: 600; }
-pre { white-space: pre-wrap; color: var(--ink); }
+pre { white-space: pre-wrap; overflow-wrap: anywhere; color: var(--ink); }
 progress { appearance: none; height: 8px; border: 1px solid var(--edge); border-radius: 4px; overflow: hidden;
   background: var(--panel); vertical-align: middle; }
 progress::-webkit-progress-bar { background: var(--panel); }
@@ -89,6 +89,11 @@ def theme(style: str) -> Theme:
                     "major_label_text_font_size": "12px",
                     "major_label_text_color": c["ink"],
                     "title_text_font_style": "normal",
+                },
+                "ScaleBar": {
+                    "bar_line_color": c["ink"],
+                    "label_text_color": c["ink"],
+                    "label_text_font_size": "12px",
                 },
                 "Legend": {
                     "background_fill_color": c["panel"],

@@ -73,7 +73,8 @@ class SummaryPanel:
             ions += ", preview"
         tone = "var(--faint)" if maps.preview else "var(--ink)"
         self.readout.text = f'<div style="color: {tone}">{self._sentence(maps)} <small>{ions}</small></div>'
-        self._put_notes(maps.notes)
+        read = () if self._explorer is None else self._explorer.notes
+        self._put_notes([*read, *(note for note in maps.notes if note not in read)])
 
     def _sentence(self, maps):
         """The verdict on both maps, with one number: the similarity of maps that are alike."""
@@ -129,7 +130,7 @@ def _facts(explorer):
         if isinstance(measured, DetectorMap):
             text = f"{measured.values.shape[1]} × {measured.values.shape[0]} bins"
         else:
-            text = f"{len(measured):,} ions"
+            text = f"{np.count_nonzero(measured.detected):,} ions"
             if measured.voltage is not None and np.ptp(measured.voltage) > 0:
                 text += f", {_voltages(measured.voltage)}"
         facts.append(f"<b>{second}</b> {text}")

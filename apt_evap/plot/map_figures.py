@@ -84,9 +84,9 @@ def detector_map(
     if (circle := _circle(map)) is not None:
         ax.add_patch(Circle(*circle, fill=False, edgecolor=RIM, linewidth=0.8))
     if title:
-        set_title(ax, _wrap(title, 36), pad=8)
+        set_title(ax, wrapped(title, 36), pad=8)
     if caption:
-        set_caption(ax, _wrap(describe(map), 54))  # fits above a map of `detector_maps`
+        set_caption(ax, wrapped(describe(map), 54))  # fits above a map of `detector_maps`
     if colorbar:
         add_colorbar([image], ax)
     return ax
@@ -266,7 +266,7 @@ def describe(map: DetectorMap) -> str:
     return ", ".join(parts)
 
 
-def _wrap(text, width):
+def wrapped(text: str, width: int) -> str:
     """Break text into lines, at commas if possible."""
     unbroken = text.replace(" ", "\N{NO-BREAK SPACE}").replace(",\N{NO-BREAK SPACE}", ", ")
     lines = "\n".join(

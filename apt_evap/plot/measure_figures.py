@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_choice, check_kind, check_sequence
@@ -15,6 +16,7 @@ from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default
 from apt_evap.reconstruction.truth_comparison import TruthComparison
 
 _DOTS = 20_000  # solutes from the side: more hide each other
+_SIZES = 40  # bars, at most
 _FEWEST = 3  # solutes with a distribution of distances
 
 
@@ -177,7 +179,12 @@ def _choice(ax: Axes, result) -> None:
         set_title(ax, f"choice of the separation, p = {choice.p_value:.2f}", fontsize="medium")
         return
     if len(result):
-        ax.hist(result.solutes, bins=min(40, 5 + len(result)), color="C0")
+        least, most = int(result.solutes.min()), int(result.solutes.max())
+        step = -(-(most - least + 1) // _SIZES)
+        ax.hist(result.solutes, bins=np.arange(least, most + step + 1, step) - 0.5, color="C0")
+        ax.set_xlim(least - 2.5 * step, most + 2.5 * step)
+        for axis in (ax.xaxis, ax.yaxis):
+            axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     ax.set(xlabel="solutes of a cluster", ylabel="clusters")
     set_title(ax, "sizes", fontsize="medium")
 

@@ -1,25 +1,29 @@
 """Poles and zone lines over a detector map."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 
+from apt_evap._common.label_places import place_labels
 from apt_evap._common.validation import check_kind
 from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
+from apt_evap.maps.crystallography.directions import ZONES, zones
+from apt_evap.maps.crystallography.directions import label as indices_label
 from apt_evap.maps.crystallography.directions import poles as poles_of
-from apt_evap.maps.crystallography.directions import zones
 from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation
 from apt_evap.plot._figure import DrawnAxes, with_default_settings
+from apt_evap.plot._labels import Placement, box_of, place_text, sizes_of
 from apt_evap.simulation.run import Run
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")
+_GAP = 1.5  # between the circle of a pole and its label [points]
 _AZIMUTHS = np.radians(np.arange(0.0, 360.5, 0.5))
-_APART = 30  # smallest distance between labels [points], at font size 9
 
 
 @with_default_settings
@@ -72,12 +76,16 @@ def poles(
 
     if zone_families is None or len(zone_families):
         axes = zones(material, zone_families)
-        for axis, family in zip(orientation.directions(axes.directions), axes.families, strict=True):
+        named = dict(enumerate(ZONES[material.structure] if zone_families is None else zone_families))
+        for axis, family in zip(orientation.directions(axes.directions), axes.families.tolist(), strict=True):
             first, second = np.linalg.svd(axis[None])[2][1:]
             circle = np.cos(_AZIMUTHS)[:, None] * first + np.sin(_AZIMUTHS)[:, None] * second
             places = projection.places(circle)
             places[~is_visible(places)] = np.nan
-            ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5)
+            name = None
+            if family in named and not np.isnan(places).all():  # the first line of its family
+                name = f"zone lines of ⟨{indices_label(named.pop(family))}⟩"
+            ax.plot(*places.T, color=_COLORS[family % len(_COLORS)], linewidth=0.8, alpha=0.9, zorder=2.5, label=name)
     if families:
         crystal_poles = poles_of(material, families)
         places = projection.places(orientation.directions(crystal_poles.normals))
@@ -85,20 +93,30 @@ def poles(
         areas = 60 * (crystal_poles.spacings[selection] / crystal_poles.spacings.max()) ** 2
         outline = [withStroke(linewidth=2, foreground="black")]
         ax.scatter(*places[selection].T, s=areas, facecolors="none", edgecolors="white", linewidths=1.2, zorder=3,
-                   path_effects=outline)  # fmt: skip
-        label_points = []
-        box = ax.get_window_extent()  # equal scales in x and y, as the axes have only after drawing
-        scale = min(box.width / np.ptp(x_limits), box.height / np.ptp(y_limits)) * 72 / ax.figure.dpi
-        for index in selection if labels else ():
-            point = places[index] * scale
-            if all(np.hypot(*(point - other)) > _APART * size / 9 for other in label_points):
-                label_points.append(point)
-                at_edge = places[index, 0] > x_limits[1] - 0.07 * (x_limits[1] - x_limits[0])
-                ax.annotate(crystal_poles.labels[index], places[index], xytext=(-4 if at_edge else 4, 4), size=size,
-                            textcoords="offset points", ha="right" if at_edge else "left", color="white",
-                            path_effects=outline, clip_on=True)  # fmt: skip
+                   path_effects=outline, label="poles" if len(selection) else None)  # fmt: skip
+        texts = [
+            ax.annotate(crystal_poles.labels[index], places[index], xytext=(0, 0), textcoords="offset pixels",
+                        size=size, ha="left", va="bottom", color="white", path_effects=outline, clip_on=True)
+            for index in (selection if labels else ())
+        ]  # fmt: skip
+        ax.add_artist(Placement(partial(_place_labels, ax, texts, np.sqrt(areas / np.pi))))
     ax.set(xlim=x_limits, ylim=y_limits)
     return ax
+
+
+def _place_labels(ax, texts, radii, renderer):
+    """Place labels beside their poles, those of the largest spacings first."""
+    point = ax.figure.dpi / 72
+    options, circles = [], []
+    for text, radius, (width, height) in zip(texts, radii * point, sizes_of(texts, renderer), strict=True):
+        x, y = ax.transData.transform(text.xy)
+        circles.append((x - radius, y - radius, x + radius, y + radius))
+        radius += _GAP * point
+        beside = x + radius, x - radius - width
+        above = y + 0.5 * (radius - height), y - 0.5 * (radius + height)
+        options.append([[(left, low, left + width, low + height)] for low in above for left in beside])
+    for text, boxes in zip(texts, place_labels(options, box_of(ax, renderer), circles), strict=True):
+        place_text(text, boxes)
 
 
 def _oriented(orientation, projection):

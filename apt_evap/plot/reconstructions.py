@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from apt_evap._common.digits import rounded_text
 from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import add_colorbar, new_figure, set_title, with_default_settings
 from apt_evap.plot.map_figures import binned
+from apt_evap.reconstruction.consistency import density_near_axis
 from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges
 
@@ -22,6 +25,8 @@ _SECTIONS = 60  # along the depth, of at least FEWEST ions
 _POINTS = 1_000_000  # of a line
 FEWEST = 50
 """Fewest ions of a picture."""
+_LONG = 2.0  # depth over width of a reconstruction that is drawn with its depth from left to right
+_IN_LEGEND = 25  # points^2, of a dot
 _CORE = 0.5  # of the field of view, in which profiles are counted
 OUTSIDE = "outside every range"
 
@@ -32,10 +37,11 @@ def reconstruction(
 ) -> NDArray[np.object_]:
     """Draw a reconstruction: a slice from the side, the ions per area along the axis, a depth profile, the composition.
 
-    The slice is as thick as a tenth of the width, in the colours of the bars of the composition. The depth profile is
-    that of the ions within half the field of view: of several species their fractions, else the number of ions per
-    volume beside its expectation, the efficiency divided by the atomic volume. Of a single species the radius of the
-    cap is drawn in place of the composition.
+    The slice is as thick as a tenth of the width, in the colours of the species. Of a reconstruction that is more than
+    twice as deep as wide, slice and profile have the depth from left to right. The depth profile is that of the ions
+    within half the field of view: of several species their fractions, else the number of ions per volume beside its
+    expectation, the efficiency divided by the atomic volume. Of a single species the radius of the cap is drawn in
+    place of the composition.
 
     Parameters
     ----------
@@ -44,7 +50,8 @@ def reconstruction(
     ranges : Ranges, optional
         Ranges of mass that give the species of measured ions; simulated ions have theirs.
     title : str, optional
-        Title of the figure; by default the number of ions and the constants.
+        Such as the name of the file, written before the number of ions, the size, and the ions per volume near the
+        axis.
 
     Returns
     -------
@@ -70,24 +77,48 @@ def reconstruction(
     if len(result) < FEWEST:
         raise ValueError(f"result must have at least {FEWEST} ions for a picture, got {len(result)}")
     names, species = species_of(result, ranges)
-    figure = new_figure((11.0, 8.4))
-    figure.set_layout_engine("constrained")  # not compressed: the panels stay in their columns
-    axes = figure.subplots(2, 2).ravel()
-    _side(axes[0], result, names, species)
-    _top(axes[1], result)
-    if len(names) > 1:
-        _fractions(axes[2], result, names, species)
-        _composition(axes[3], names, species)
+    width, _, depth = np.ptp(result.positions, axis=0)
+    is_long = depth > _LONG * width
+    if is_long:
+        heights = max(1.0, 9.5 * width / depth) + 0.8, 2.8, 3.6  # inch, each with its labels
+        figure = new_figure((11.0, sum(heights) + 1.2))
+        panels = figure.subplot_mosaic("AA;CC;BD", height_ratios=heights)
     else:
-        _density(axes[2], result)
+        figure = new_figure((11.0, 9.0))
+        panels = figure.subplot_mosaic("AB;CD")
+    figure.set_layout_engine("constrained")  # not compressed: the panels stay in their columns
+    side, top, profile, last = (panels[name] for name in "ABCD")
+    _side(side, result, names, species, is_long)
+    _top(top, result)
+    if len(names) > 1:
+        _fractions(profile, result, names, species)
+        _composition(last, names, species)
+        legend = figure.legend(*side.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+        for handle in legend.legend_handles:
+            handle.set_sizes([_IN_LEGEND])
+    else:
+        _density(profile, result)
         every = slice(None, None, -(-len(result) // _POINTS))  # many more than the pixels of the picture
-        axes[3].plot(result.depths[every], result.radii[every], color="C0")
-        axes[3].set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
-    if title is None:
-        x, y, z = (np.ptp(column) for column in result.positions.T)
-        title = f"{len(result):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"
-    figure.suptitle(title, parse_math=False)
-    return axes
+        last.plot(result.depths[every], result.radii[every], color="C0")
+        last.set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
+    lines = _description(result)
+    if title is not None:
+        lines[0] = f"{title}: {lines[0]}"
+    figure.suptitle("\n".join(lines), parse_math=False, fontsize="medium")
+    return np.array([side, top, profile, last])
+
+
+def _description(result):
+    """Number of ions, size, and ions per volume near the axis."""
+    x, y, z = np.ptp(result.positions, axis=0)
+    density = density_near_axis(result)
+    lines = [f"{len(result):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"]
+    if np.isfinite(density.found):
+        ratio = density.found / density.expected
+        lines.append(f"near the axis {density.found:.3g} ions per nm³, {ratio:.2f} × efficiency / atomic volume")
+        if not density.good:
+            lines.append(density.meaning)
+    return lines
 
 
 def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str], Integers]:
@@ -110,16 +141,22 @@ def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str]
     return [*sorted_names[:_MOST], "other"], np.minimum(rank[group], _MOST)
 
 
-def _side(ax: Axes, result, names, species):
+def _side(ax: Axes, result, names, species, is_long):
     x, y, z = result.positions.T
     near = np.flatnonzero(np.abs(y - np.median(y)) < 0.05 * np.ptp(y))
     near = near[:: max(1, -(-len(near) // _DOTS))]
     size = float(np.clip(_DOTS / max(len(near), 1), 1.5, 12.0))
     for number, name in enumerate(names):
         ions = near[species[near] == number]
-        ax.scatter(x[ions], z[ions], s=size, linewidths=0, color=_COLORS[number], label=name, rasterized=True)
-    ax.invert_yaxis()  # the apex of the first ion above
-    ax.set(aspect="equal", xlabel="x [nm]", ylabel="depth z [nm]")
+        places = (z[ions], x[ions]) if is_long else (x[ions], z[ions])
+        label = name.replace("$", r"\$")
+        ax.scatter(*places, s=size, linewidths=0, color=_COLORS[number], label=label, rasterized=True)
+    if is_long:
+        ax.set(aspect="equal", xlabel="depth z [nm]", ylabel="x [nm]")
+        ax.yaxis.set_major_locator(MaxNLocator(3))
+    else:
+        ax.invert_yaxis()  # the apex of the first ion above
+        ax.set(aspect="equal", xlabel="x [nm]", ylabel="depth z [nm]")
     set_title(ax, f"from the side, {0.1 * np.ptp(y):.1f} nm thick")
 
 
@@ -182,12 +219,13 @@ def _composition(ax: Axes, names, species):
     error = np.sqrt(fraction * (1 - fraction) / number.sum())
     places = np.arange(len(names))
     ax.barh(places, fraction, xerr=error, color=_COLORS[: len(names)])
-    for place, value, wide in zip(places, fraction, error, strict=True):
-        ax.annotate(
-            f"{value:.2%} ± {wide:.2%}", (value, place), xytext=(6, 0), textcoords="offset points", va="center",
-            fontsize="small",
-        )  # fmt: skip
-    ax.set_yticks(places, [name.replace("$", r"\$") for name in names])
+    ax.set_yticks(
+        places,
+        [
+            name.replace("$", r"\$") + f"\n{rounded_text(value, wide)} ± {rounded_text(wide, wide)} %"
+            for name, value, wide in zip(names, 100 * fraction, 100 * error, strict=True)
+        ],
+        fontsize="small",
+    )
     ax.invert_yaxis()
-    ax.set(xlabel="fraction of all ions", xlim=(0, 1.6 * fraction.max()))  # with room for the texts
-    ax.set_xticks([tick for tick in ax.get_xticks() if tick <= min(1.0, 1.6 * fraction.max())])
+    ax.set(xlabel="fraction of all ions", xlim=(0, min(1.0, 1.05 * (fraction + error).max())))

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, check_sequence
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charge, with_default_settings
+from apt_evap.plot._labels import label_peaks
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
 from apt_evap.spectra.mass_ranges import Ranges
@@ -18,12 +19,11 @@ _MOST_BINS = 1_000_000
 _CHUNK = 1 << 18  # ions
 _MARGIN = 0.04  # of the range of masses, on both sides
 _OCCUPIED = 1e-3  # of the ions in 1 Da at the ends of the default range; background is less
-_WIDTH_OF_LABEL = 0.018  # of the axes: a rotated label in a figure of the default size
+_SAME_NAME = 0.05  # of the axes, within which ranges of one name have one label
 _SHARP, _SURROUNDINGS = 0.05, 2.0  # half width of a peak, and of the spectrum around it [Da]
 _TAIL = 0.004  # of the mass, by which energy deficits may shift the top of a peak
 _SIGNIFICANT = 5.0  # standard deviations of a peak above the ions around it
 _FEWEST = 4.0  # expected ions of an isotope with a label
-_LOW = 1.5  # a peak is too low for a label if another one behind the label is this many times higher
 _HIGHEST_CHARGE = 4
 
 
@@ -108,7 +108,7 @@ def _draw(masses, labels, ax, bin_width, limits, elements):
             ax.stairs(values, edges, baseline=base, color="C0", fill=True, alpha=0.2, linewidth=0, zorder=1)
     ylabel = f"ions per {bin_width:g} Da" if len(masses) == 1 else "fraction of the ions [1/Da]"
     top = max(height.max() for height in heights)
-    labelled = _label_isotopes(ax, elements, edges, counts, heights, (low, high))
+    labelled = _label_isotopes(ax, elements, edges, counts, heights)
     # space above the peaks for their labels, and for the legend
     decades = np.log10(max(top / base, 10))
     space = (0.28 if labelled else 0.06) + (0.1 if any(labels) else 0.0)
@@ -153,24 +153,30 @@ def _draw_named(spectrum_of_ions, labels, ax, bin_width, limits, ranges):
         zorder=3,
     )
     formulas = list(dict.fromkeys(formula for formula, _, _ in named))
-    places: list[float] = []
+    labels_of_peaks: list[tuple[str, tuple[float, float], str]] = []
     for formula, text, parts in named:
         color = f"C{1 + formulas.index(formula) % 9}"
         for low, high in parts:
             ax.axvspan(low, high, color=color, alpha=0.2, linewidth=0)
         tops = [
-            (int(inside.max()), float(edges[first + int(np.argmax(inside))]))
+            (max(int(inside.max()), 0.5), float(edges[first : first + 2 + int(np.argmax(inside))][-2:].mean()))
             for first, inside in ((bins.start, count[bins]) for bins in (_bins_between(edges, *i) for i in parts))
             if inside.size
         ]
-        if not tops or any(abs(max(tops)[1] - place) < _WIDTH_OF_LABEL * (limits[1] - limits[0]) for place in places):
-            continue
-        top, place = max(tops)
-        places.append(place)
-        ax.annotate(
-            text, (place, max(top, 1)), xytext=(0, 4),
-            textcoords="offset points", ha="center", va="bottom", color=color, annotation_clip=True,
-        )  # fmt: skip
+        if tops:
+            labels_of_peaks.append((text, max(tops)[::-1], color))
+    labels_of_peaks.sort(key=lambda label: -label[1][1])
+    near = _SAME_NAME * (limits[1] - limits[0])
+    label_peaks(
+        ax,
+        [
+            label
+            for number, label in enumerate(labels_of_peaks)
+            if not any(label[0] == text and abs(label[1][0] - x) < near for text, (x, _), _ in labels_of_peaks[:number])
+        ],
+        edges,
+        np.maximum(count, 0.5),
+    )
     if ranges is None:
         _mark_unexplained(ax, spectrum_of_ions, edges, count)
     bottom, top = ax.get_ylim()
@@ -255,33 +261,24 @@ def _default_limits(masses):
     return max(low - margin, 0.0), high + margin
 
 
-def _label_isotopes(ax, elements, edges, counts, heights, limits):
-    """Write the isotopes above their peaks where there is space: the most abundant of each charge, then the others."""
+def _label_isotopes(ax, elements, edges, counts, heights):
+    """Write the isotopes above their peaks: the most abundant of each charge, then the others."""
     highest = np.max(heights, axis=0)
-    width = _WIDTH_OF_LABEL * (limits[1] - limits[0])
-    places, mains, others = [], [], []
+    mains, others = [], []
     for element in elements:
-        for charge in range(1, _HIGHEST_CHARGE + 1):
+        for charge in range(1, min(list(ISOTOPES).index(element) + 1, _HIGHEST_CHARGE) + 1):  # of H only H+
             isotopes = [
                 (highest[_bins_of_peak(edges, mass / charge)].max(), mass / charge, (element, charge, mass))
                 for mass, _ in _visible_isotopes(element, charge, counts, edges)
             ]
             mains += isotopes[:1]
             others += isotopes[1:]
-    labelled = set()
-    for group in (mains, others):
-        for top, place, (element, charge, mass) in sorted(group, reverse=True):
-            crowded = any(abs(place - other) < width for other in places)
-            behind = highest[_bins_between(edges, place - 0.6 * width, place + 0.6 * width)].max(initial=top)
-            if crowded or (group is others and ((element, charge) not in labelled or behind > _LOW * top)):
-                continue
-            places.append(place)
-            labelled.add((element, charge))
-            ax.annotate(
-                ion_label(element, charge, round(mass)), (place, behind), xytext=(2, 4), textcoords="offset points",
-                rotation=90, ha="center", va="bottom", fontsize="small", annotation_clip=True,
-            )  # fmt: skip
-    return bool(places)
+    labels = [
+        (ion_label(element, charge, round(mass)), (place, top), "k")
+        for top, place, (element, charge, mass) in [*sorted(mains, reverse=True), *sorted(others, reverse=True)]
+    ]
+    label_peaks(ax, labels, edges, highest, rotation=90, fontsize="small")
+    return bool(labels)
 
 
 def _visible_isotopes(element, charge, counts, edges):

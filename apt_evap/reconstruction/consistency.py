@@ -88,7 +88,7 @@ def checks(
         for name, (place, spacing) in known
     ]
     limits = [_rim(reconstruction)] if reconstruction.settings.lens is not None else []
-    return [*spacings, _density(reconstruction), *limits]
+    return [*spacings, density_near_axis(reconstruction), *limits]
 
 
 def _rim(reconstruction):
@@ -122,9 +122,10 @@ def _planes(reconstruction, name, place, spacing, width):
     return Check(f"spacing of the {name} planes [nm]", value, spacing, meaning)
 
 
-def _density(reconstruction):
-    """Ions per volume near the axis."""
+def density_near_axis(reconstruction: Reconstruction) -> Check:
+    """Ions per volume within half the field of view, against the efficiency over the atomic volume."""
     settings, positions = reconstruction.settings, reconstruction.positions
+    assert settings.atomic_volume is not None
     expected = settings.efficiency / settings.atomic_volume
     across = np.hypot(positions[:, 0], positions[:, 1])
     rim = _CORE * float(np.quantile(across, 0.99))
@@ -133,5 +134,7 @@ def _density(reconstruction):
     depths = reconstruction.depths[near]
     volume = math.pi * rim**2 * float(reconstruction.depths[-1] - reconstruction.depths[0])
     value = len(depths) / volume if volume > 0 else math.nan
-    meaning = "more near the axis: the compression is too small, or ions are focused; fewer: the reverse"
+    small = "more than expected: the compression is too small, or ions are focused on the axis"
+    large = "fewer than expected: the compression is too large, or ions are deflected from the axis"
+    meaning = small if value > expected else large
     return Check("ions per nm^3 near the axis", float(value), expected, meaning)

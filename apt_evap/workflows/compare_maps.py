@@ -109,7 +109,7 @@ def compare(
     0.2 eV
     True
     """
-    from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+    from apt_evap._common.recorded_warnings import recorded_warnings
 
     with recorded_warnings() as messages:
         if folder is not None:

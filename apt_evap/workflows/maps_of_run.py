@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from apt_evap._common.codec import from_plain
 from apt_evap.detection.binning import shown_bins
 from apt_evap.detection.detector_map import DetectorMap
@@ -11,6 +13,8 @@ from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
 from apt_evap.simulation.config.map_panels import MapSettings, Panel
 from apt_evap.simulation.run import Run
+
+_FEWEST = 20  # ions of a phase whose place is drawn
 
 
 def settings_of_maps(run: Run, perturbations: Sequence[Perturbation] = ()) -> MapSettings:
@@ -38,6 +42,24 @@ def run_maps(
     if sigma is None:
         sigma = default_smoothing(grid, None if settings.bins else len(run))
     return [detector_map.smoothed(sigma) for detector_map in maps], [panel.title for panel in settings.panels]
+
+
+def phase_maps(
+    run: Run, maps: Sequence[DetectorMap], settings: MapSettings, choose: Callable[[Hits], Hits] = lambda hits: hits
+) -> list[dict[str, DetectorMap]]:
+    """Maps of the ions of each further phase of a specimen, by its name, for each of the maps of `run_maps`."""
+    phases: list[dict[str, DetectorMap]] = []
+    for panel, like in zip(settings.panels if len(run.phase_names) > 1 else (), maps, strict=False):
+        hits = choose(run.hits(panel.perturbation))
+        parts = {name: hits[hits.extra["phase_name"] == name] for name in run.phase_names[1:]}
+        phases.append(
+            {
+                name: part.map(like=like, position_step=None).smoothed(like.smoothing)
+                for name, part in parts.items()
+                if np.count_nonzero(part.detected) >= _FEWEST
+            }
+        )
+    return phases
 
 
 def map_summaries(maps: Any, titles: Sequence[str]) -> list[dict[str, Any]]:

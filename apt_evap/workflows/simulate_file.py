@@ -22,7 +22,7 @@ from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.warnings import WorkflowWarning, warn
-from apt_evap.workflows.maps_of_run import map_summaries, run_maps
+from apt_evap.workflows.maps_of_run import map_summaries, phase_maps, run_maps
 from apt_evap.workflows.written_pictures import check_output, is_picture, picture_path, save_picture
 
 _CONTINUE = "--resume continues (resume=True in Python)"
@@ -222,7 +222,8 @@ def _drawn(run, path, picture, config, seconds, note):
 
     try:
         maps, titles = run_maps(run, config.maps)
-        done = save_picture(picture, maps, titles, title=specimen_title(run))
+        phases = phase_maps(run, maps, config.maps)
+        done = save_picture(picture, maps, titles, title=specimen_title(run), phases=phases)
     except ValueError as error:
         raise ValueError(f"no maps are drawn, the run is in {str(path)!r}: {error}") from error
     note(done)

@@ -280,7 +280,7 @@ class Twin:
 
     def _compared(self, run, measured, folder):
         """The study, with its files if there is a folder."""
-        from apt_evap.plot.report.origin import recorded_warnings  # with Matplotlib
+        from apt_evap._common.recorded_warnings import recorded_warnings
 
         written = folder is not None
         with recorded_warnings(IN_LINES):

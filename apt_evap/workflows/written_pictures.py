@@ -3,7 +3,7 @@
 import io
 import os
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,17 @@ def save_picture(
     crystal: tuple[Orientation, Projection] | None = None,
     *,
     width: float | None = None,
+    phases: Sequence[Mapping[str, DetectorMap]] = (),
     **colors: Any,
 ) -> str:
     """Draw maps side by side into a file, perhaps with the poles of a crystal; return what `save_figure` does.
 
-    With a width [mm] the figure is one of a paper, without titles. `colors` are ``colormap`` and ``label``.
+    With a width [mm] the figure is one of a paper, without titles and outlines of `phase_maps`. `colors` are
+    ``colormap`` and ``label``.
     """
     from apt_evap.detection.color_limits import common_limits  # with Matplotlib
+    from apt_evap.plot._labels import legend_below
+    from apt_evap.plot.phase_outlines import phase_outlines
 
     if width is None:
         axes = plot.detector_maps(maps, titles, limits=common_limits(maps), title=title, **colors)
@@ -53,6 +57,10 @@ def save_picture(
     if crystal is not None:
         for ax, detector_map in zip(axes, maps, strict=True):
             plot.poles(ax, *crystal, region=detector_map, families=8, size=9 if width is None else 6)
+    if width is None:
+        if phases:
+            phase_outlines(list(axes), maps, phases)
+        legend_below(list(axes))
     return save_figure(path, axes[0].figure)
 
 

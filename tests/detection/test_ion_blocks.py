@@ -140,7 +140,7 @@ def map_of(words):
     """Map that a command draws."""
     from apt_evap.cli._maps_of_file import maps_of_file
 
-    (drawn,), titles, title, crystal = maps_of_file(make_parser().parse_args(["map", *words]))
+    (drawn,), titles, title, crystal, _ = maps_of_file(make_parser().parse_args(["map", *words]))
     yield drawn, (titles, title, crystal)
 
 

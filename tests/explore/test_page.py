@@ -34,6 +34,7 @@ from apt_evap.explore.measured_ions import IonSelection
 from apt_evap.explore.page import Page
 from apt_evap.explore.run_progress import ServerState
 from apt_evap.explore.server import serve
+from apt_evap.explore.spectrum_panel import _width_of
 from apt_evap.io.measured_file import MeasuredFile
 from apt_evap.io.rrng import write_rrng
 
@@ -477,6 +478,30 @@ def test_poles_are_clicked(measured):
     page.close()
 
 
+def test_a_candidate_is_drawn_inside_the_map_and_its_handles_where_they_can_be_dragged(run):
+    x, y = np.meshgrid(*[np.linspace(-39, 39, 40)] * 2)
+    edges = np.linspace(-40, 40, 41)
+    disc = ae.DetectorMap.from_array(1.0 + 0 * x, edges, edges, mask=np.hypot(x, y) < 30)
+    page = Opened(Explorer(None, disc)).page
+    index, tools = page.index, page.tools.choice
+    index.material.value = "Ni"
+    index._put([(ae.Orientation("Ni", axis=(1, 1, 1)), ae.detection.Projection(40.0), "indexed")], "")
+    for source in (index.lines, index.poles):
+        radii = np.hypot(source.data["x"], source.data["y"])
+        assert len(radii) > 3 and np.nanmax(radii) < 30 + 1.5
+    assert "zone lines" in index.text.text and "orange dots" in index.text.text
+    lines, held = index._drawings[0], index._handles[0]
+    assert lines.visible and not held.visible
+    tools.active = tools.labels.index("pole")
+    assert lines.visible and held.visible
+    tools.active = tools.labels.index("line")
+    assert lines.visible and not held.visible
+    page.close()
+    both = Opened(Explorer(run, disc, ae.Registration(0.0, 0.4, (0.0, 0.0)))).page
+    assert not both.index._drawings[0].visible  # the poles of the run are shown
+    both.close()
+
+
 @pytest.mark.slow
 def test_a_fit_of_earlier_marks_is_not_shown(measured):
     """Marks are faster than fits: what is shown is the fit of all marks, or of none."""
@@ -720,6 +745,85 @@ def test_the_spectrum_selects_ions(tmp_path, monkeypatch):
     page.close()
 
 
+def boxes_of_labels(panel):
+    """Box of each label of the spectrum [px], and the frame."""
+    fig, data = panel.figure, panel.labels.data
+    wide, high = panel._inner.values()
+    x = (np.array(data["x"]) - fig.x_range.start) * wide / (fig.x_range.end - fig.x_range.start)
+    y = high * np.log(np.array(data["y"]) / fig.y_range.start) / np.log(fig.y_range.end / fig.y_range.start)
+    widths = [_width_of(label) for label in data["label"]]
+    return dict(zip(data["label"], zip(x, y, x + widths, y + 17.0, strict=True), strict=True)), (wide, high)
+
+
+def test_labels_of_the_spectrum_are_apart_at_any_zoom(tmp_path, monkeypatch):
+    """Those of the largest peaks are there; zoomed, there is a place for all."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(7)
+    peaks = {1.0078: 9_000, 2.0157: 6_000, 62.930: 30_000, 64.928: 13_400, 31.465: 3_000, 32.464: 1_340}
+    peaks |= {15.995: 900, 18.011: 500, 17.003: 300}
+    mass = np.concatenate([at * rng.normal(1, 3e-4, n) for at, n in peaks.items()] + [rng.uniform(0.5, 150, 6_000)])
+    x, y = rng.normal(size=(2, len(mass))) * 8.0
+    hits = ae.Hits(x=x, y=y, mass_to_charge=mass)
+    opened = Opened(Explorer(None, hits, file=MeasuredFile("ions.epos")))
+    panel = opened.page.spectrum
+    opened.settle(lambda: panel.named is not None)
+    names = [ion.name for ion in panel.named.ions if ion.intervals]
+    assert {"H⁺", "H₂⁺", "Cu⁺", "Cu²⁺", "O⁺", "H₂O⁺"} <= set(names)
+
+    def check():
+        boxes, (wide, high) = boxes_of_labels(panel)
+        for number, (left, lower, right, upper) in enumerate(boxes.values()):
+            assert left > -0.01 and lower > 0 and right < wide + 0.01 and upper < high + 0.01
+            for other in list(boxes.values())[:number]:
+                assert (
+                    left > other[2] - 0.01
+                    or other[0] > right - 0.01
+                    or lower > other[3] - 0.01
+                    or other[1] > upper - 0.01
+                )
+        return set(boxes)
+
+    assert {"H⁺", "H₂⁺", "Cu⁺", "Cu²⁺"} <= check()
+    panel.figure.x_range.update(start=14.5, end=20.0)
+    opened.settle(lambda: not panel._labels_wait)
+    assert check() == {"O⁺", "OH⁺", "H₂O⁺"}
+    panel._resized("inner_width", 900.0)
+    panel.figure.x_range.update(start=0.0, end=70.0)
+    opened.settle(lambda: not panel._labels_wait)
+    assert check() == set(names)
+    opened.page.close()
+
+
+def test_strays_are_counted_as_by_the_shell_and_told_on_the_page(tmp_path, monkeypatch, capfd):
+    """A misread signal far outside is one of the ions of the file, not of those that are shown, also in a search."""
+    monkeypatch.chdir(tmp_path)
+    rng, n = np.random.default_rng(8), 20_000
+    radius, azimuth = 20 * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    x, y = radius * np.cos(azimuth), radius * np.sin(azimuth)
+    x[7], y[7] = -500.0, 500.0
+    mass = rng.choice([62.93, 64.93, 13.988], n, p=[0.5, 0.22, 0.28]) * rng.normal(1.0, 3e-4, n)
+    mass[7] = 62.93
+    ae.write("ions.epos", ae.Hits(x=x, y=y, mass_to_charge=mass, voltage=np.full(n, 5e3), pulse_id=np.arange(n)))
+    with pytest.warns(ae.warnings.DataWarning, match="far outside"):
+        explorer, _ = explorer_and_view(make_parser().parse_args(["explore", "ions.epos"]))
+    opened = Opened(explorer)
+    page, panel = opened.page, opened.page.spectrum
+    opened.settle(lambda: panel.named is not None and panel._pending is None and "Da" in panel.told.text)
+    shown = re.match(r"([\d,]+) of ([\d,]+) ions", panel.told.text)
+    copper = np.count_nonzero(mass > 60) - 1
+    assert shown[2] == f"{n - 1:,}" and int(shown[1].replace(",", "")) == pytest.approx(copper, abs=20)
+    assert f"<b>ions.epos</b> {shown[1]} ions" in page.summary.facts.text
+    assert "far outside the field of view" in page.summary.notes.text and page.summary.notes.visible
+    # another process gets no stray, and its warnings are not written to the terminal
+    measured = []
+    monkeypatch.setattr("apt_evap.explore.index_panel.SearchProcess.call", lambda self, _, arguments, *__: (
+        measured.append(arguments[0]), (_ for _ in ()).throw(ValueError("enough")))[0])  # fmt: skip
+    page.index._search(page.index.search)
+    opened.settle(lambda: bool(measured))
+    assert len(measured[0]) == int(shown[1].replace(",", "")) and measured[0].x.min() > -100
+    page.close()
+
+
 @pytest.mark.usefixtures("spectra_once")
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
@@ -756,6 +860,14 @@ def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
     counted = np.nansum(page.correlation.pairs.data["image"][0])
     assert counted == pytest.approx(n, rel=0.01)  # n / 2 pairs, at both places
     page.close()
+
+
+def test_pictures_of_atoms_have_a_scale(opened):
+    """A bar in nanometres, of the range in which positions are drawn."""
+    panels = opened.page.specimen.view, opened.page.reconstruction.view, opened.page.reconstruction.truth
+    for view in panels:
+        (bar,) = [model for model in view.figure.below + view.figure.center if model.__class__.__name__ == "ScaleBar"]
+        assert bar.unit == "nm" and bar.range is view.figure.x_range
 
 
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.AptWarning")

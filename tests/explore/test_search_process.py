@@ -111,6 +111,24 @@ def test_a_search_tells_its_progress_and_is_cancelled(measured, tmp_path, monkey
     assert "cancelled" in panel.text.text and not panel.cancel.visible
 
 
+_WARNS = """
+from apt_evap.warnings import DataWarning, warn
+def warns():
+    warn("odd data", DataWarning)
+    return 3
+"""
+
+
+def test_warnings_of_the_process_are_sentences_not_on_the_terminal(tmp_path, monkeypatch, capfd):
+    (tmp_path / "function_that_warns.py").write_text(_WARNS)
+    monkeypatch.syspath_prepend(tmp_path)
+    with SearchProcess() as process:
+        assert process.call(importlib.import_module("function_that_warns").warns, ()) == 3
+        assert process.notes == ["odd data"]
+        assert process.call(abs, (-1,)) == 1 and process.notes == []
+    assert "odd data" not in capfd.readouterr().err
+
+
 def test_a_search_whose_process_is_killed_is_over(measured):
     later = Later()
     panel = IndexPanel([figure()], lambda: measured, "Ni", later, lambda text: None)

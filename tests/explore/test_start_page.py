@@ -17,6 +17,8 @@ from bokeh.events import ButtonClick
 from bokeh.util.token import generate_session_id
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 
+from apt_evap.cli._explorer_of_files import explorer_and_view, with_file
+from apt_evap.cli.parser import make_parser
 from apt_evap.explore.explorer import Explorer
 from apt_evap.explore.page import Page
 from apt_evap.explore.recent_files import recent_files, remember_file
@@ -53,6 +55,28 @@ def test_the_files_of_the_folder_are_opened(folder):
     assert set(page.start.buttons) == set(start.buttons)
     page.document.validate()
     page.close()
+
+
+def test_the_start_page_is_a_click_away(folder):
+    """Files that were open are closed: the next one is shown alone."""
+    write_example()
+    options = make_parser().parse_args(["explore", EXAMPLE, "--element", "Ni"])
+    explorer, _ = explorer_and_view(options)
+    asked, done = [], []
+
+    def opened(path, document):
+        asked.append(path)
+        return lambda: done.append(with_file(options, path))
+
+    page = Page(explorer, Document(), opened=opened, later=lambda function, delay: function())
+    assert page.back.visible and not Page(None, Document(), opened=opened).back.visible
+    page.back._trigger_event(ButtonClick(page.back))
+    end = time.monotonic() + 60
+    while not done and time.monotonic() < end:
+        time.sleep(0.01)
+    assert asked == [None] and done == [(None, None)] and options.run is None and options.file is None
+    again, _ = with_file(options, EXAMPLE)
+    assert again.run is None and again.names[1] == EXAMPLE
 
 
 def test_settings_of_the_folder_are_run(folder, monkeypatch):

@@ -271,7 +271,14 @@ def test_the_picture_of_an_answer_shows_its_candidates():
     found = quickly(map, "Ni")
     assert found.decided and len(ae.plot.indexing(found)) == 3
     axes = ae.plot.indexing(found, candidates=2)
-    assert len(axes) == 5 and f"{found.best}" in axes[1].get_title()
+    assert len(axes) == 5 and f"{found.best}" in axes[1].get_title().replace("\n", " ")
+    # lines, poles and colours are explained
+    figure = axes[0].figure
+    names = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "poles" in names and "zone lines of ⟨$110$⟩" in names and len(set(names)) == len(names)
+    bars = [ax.get_ylabel() for ax in figure.axes if ax not in set(axes)]
+    assert bars == ["hits per area / mean", "predicted hits per area / mean"]
+    assert len({image.get_clim() for ax in axes[2::2] for image in ax.images}) == 1
     # the pattern beside it is that of the map
     predicted = found.best.predicted(map)
     inside = map.mask

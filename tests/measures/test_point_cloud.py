@@ -260,6 +260,12 @@ def test_pictures():
     clusters = cloud.clusters("Cu", 0.4, 50)
     axes = ae.plot.clusters(clusters)
     assert axes[2].get_xlabel() == "solutes of a cluster" and axes[0].get_aspect() == 1
+    axes[2].figure.draw_without_rendering()
+    bars = [(bar.get_x(), bar.get_x() + bar.get_width(), bar.get_height()) for bar in axes[2].patches]
+    for size in clusters.solutes.tolist():  # in the middle of whole numbers
+        assert sum(height for left, right, height in bars if left < size < right) >= 1
+    assert sum(height for *_, height in bars) == len(clusters)
+    assert all(tick == round(tick) for tick in [*axes[2].get_xticks(), *axes[2].get_yticks()])
     ax = ae.plot.composition_profile(cloud.proxigram(surface=ae.specimen.Sphere((0, 0, 0), RADIUS)), "Cu")
     (line,) = (container[0] for container in ax.containers)
     x, y = line.get_data()

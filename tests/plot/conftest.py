@@ -1,5 +1,7 @@
 """A small study, made once for all tests of reports."""
 
+import sys
+
 import pytest
 from fits import fit_energies
 from rough import ROUGH
@@ -25,3 +27,11 @@ def study(small_tip, made_once):
         progress=False,
         **energies,
     )
+
+
+@pytest.fixture(autouse=True)
+def _figures_closed():
+    """Figures of pyplot live until they are closed."""
+    yield
+    if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
+        pyplot.close("all")

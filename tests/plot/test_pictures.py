@@ -24,6 +24,7 @@ from apt_evap.plot.map_figures import specimen_title
 from apt_evap.plot.profile_figures import rectangles
 from apt_evap.plot.responses import ion_colors
 from apt_evap.plot.specimen_figures import mark_atoms
+from apt_evap.reconstruction.consistency import density_near_axis
 
 
 @pytest.fixture(scope="module")
@@ -430,6 +431,51 @@ def test_isotopes_are_labelled_where_there_are_peaks():
     assert 12 < low < 14 and 18 < high < 20  # without the background
 
 
+def overlapping(texts):
+    """Pairs of visible texts whose boxes overlap, in pixels."""
+    boxes = [Text.get_window_extent(text) for text in texts if text.get_visible()]
+    boxes = [box.padded(-0.01) for box in boxes]  # those that touch are apart, to rounding
+    return [(a, b) for number, a in enumerate(boxes) for b in boxes[:number] if a.overlaps(b)]
+
+
+def test_labels_of_near_peaks_are_apart_and_those_of_the_largest_are_there(rng):
+    peaks = {"H": 1.0, "H2": 2.0, "C": 12.0, "Si": 14.0, "O": 16.0, "OH": 17.0, "H2O": 18.0, "Si+": 28.0, "CO": 28.6}
+    number = dict(zip(peaks, (9000, 6000, 150, 40_000, 220, 40, 160, 2500, 30), strict=True))
+    mass = np.concatenate([rng.normal(peaks[name], 0.01, number[name]) for name in peaks])
+    ions = ae.Hits(mass_to_charge=np.concatenate([mass, rng.uniform(0.5, 110, 2000)]))
+    at = np.array(list(peaks.values()))
+    ranges = ae.spectra.Ranges(names=tuple(peaks), low=at - 0.1, high=at + 0.1)
+    ax = plot.spectrum(ae.spectrum(ions, elements=["Si"]), ranges=ranges)
+    ax.figure.draw_without_rendering()
+    visible = {text.get_text() for text in ax.texts if text.get_visible()}
+    assert {"H", "H2", "C", "Si", "O", "H2O", "Si+"} <= visible
+    assert not overlapping([*ax.texts, *ax.get_legend().get_texts()])
+    frame = ax.get_window_extent()
+    counts, edges, _ = ax.patches[0].get_data()
+    for text in ax.texts:
+        box = Text.get_window_extent(text)
+        assert frame.x0 <= box.x0 and box.x1 <= frame.x1 and box.y1 <= frame.y1
+        left, right = ax.transData.inverted().transform([(box.x0, 1), (box.x1, 1)])[:, 0]
+        below = counts[(edges[1:] > left) & (edges[:-1] < right)].max()
+        assert box.y0 > ax.transData.transform((left, below))[1]  # above the curve
+    # in a small picture, too
+    small = plot.new_figure((3.4, 2.2)).subplots()
+    plot.spectrum(ae.spectrum(ions, elements=["Si"]), ax=small, ranges=ranges)
+    small.figure.draw_without_rendering()
+    shown = [text.get_text() for text in small.texts if text.get_visible()]
+    assert {"Si", "H", "H2"} <= set(shown)
+    assert not overlapping(small.texts)
+
+
+def test_near_ranges_of_one_name_have_one_label_and_hydrogen_one_charge(rng):
+    mass = np.concatenate([rng.normal(at, 0.01, 900) for at in (1.008, 58.0, 60.0)])
+    hits = ae.Hits(mass_to_charge=np.concatenate([mass, rng.uniform(0.1, 90, 3000), np.full(40, 0.252)]))
+    ranges = ae.spectra.Ranges(names=("Ni", "Ni", "H"), low=[57.9, 59.9, 0.9], high=[58.1, 60.1, 1.1])
+    ax = plot.spectrum(ae.spectrum(hits, elements=["Ni"]), ranges=ranges)
+    assert sorted(text.get_text() for text in ax.texts) == ["H", "Ni"]
+    assert {text.get_text() for text in plot.spectrum(hits, elements=["H"]).texts} == {"$^{1}$H$^{{+}}$"}
+
+
 def test_spectra_that_cannot_be_drawn(run, real):
     hits = real.hits(ae.Unperturbed())
     for ions, options, message in (
@@ -649,8 +695,17 @@ def test_a_reconstruction_from_two_sides_with_its_profile(rng):
     ranges = ae.spectra.Ranges(names=("Al", "Cu"), low=[26, 62], high=[28, 64])
     with pytest.warns(ae.warnings.DataWarning, match="outside every range"):
         side, _, fractions, bars = plot.reconstruction(found, ranges, title="a$b")
-    names = [text.get_text() for text in bars.get_yticklabels()]
-    assert names == ["outside every range", "Al", "Cu"] and side.figure.get_suptitle() == "a$b"
+    names, numbers = zip(*(text.get_text().split("\n") for text in bars.get_yticklabels()), strict=True)
+    assert names == ("outside every range", "Al", "Cu") and side.figure.get_suptitle().startswith("a$b: 9,000 ions, ")
+    (legend,) = side.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == list(names)
+    colors = [handle.get_facecolor() for handle in legend.legend_handles]
+    np.testing.assert_array_equal(np.squeeze(colors), [bar.get_facecolor() for bar in bars.patches])
+    # percent with as many digits as the error of the counts allows, on an axis without empty space
+    al = np.mean(mass == 27)
+    value, error = (float(part) for part in numbers[1].rstrip(" %").split(" ± "))
+    assert value == pytest.approx(100 * al, abs=error / 10) and error == pytest.approx(0.50, abs=0.005)
+    assert max(bar.get_width() for bar in bars.patches) < bars.get_xlim()[1] <= 1
     widths = [bar.get_width() for bar in bars.patches]
     assert widths == [np.mean(mass == each) for each in (90, 27, 63)]
     steps = fractions.lines[names.index("Al")].get_ydata()  # in the first third only
@@ -659,3 +714,26 @@ def test_a_reconstruction_from_two_sides_with_its_profile(rng):
     errors = [np.ptp(bar[:, 1]) / 2 for bars in fractions.collections for bar in bars.get_segments()]
     assert max(errors) < 0.5 / 7
     assert_nothing_cut_off(side.figure)
+
+
+def test_a_long_reconstruction_lies_along_its_depth(rng):
+    n = 40_000
+    radius, azimuth = 20 * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    ions = ae.Hits(x=radius * np.cos(azimuth), y=radius * np.sin(azimuth), mass_to_charge=np.full(n, 27.0))
+    found = ae.reconstruct(ions, atomic_volume=0.011, distance=90.0, radius=15.0, efficiency=0.1, compression=2.0)
+    assert np.ptp(found.positions[:, 2]) > 2 * np.ptp(found.positions[:, 0])
+    side, *_ = plot.reconstruction(found, title="R5083.epos")
+    assert (side.get_xlabel(), side.get_ylabel()) == ("depth z [nm]", "x [nm]") and not side.yaxis_inverted()
+    assert_nothing_cut_off(side.figure)
+    box = side.get_window_extent()
+    assert box.width > 0.75 * side.figure.bbox.width and box.width > 2 * box.height
+    ticks = [label.get_window_extent() for label in side.get_yticklabels() if label.get_text()]
+    assert not any(a.overlaps(b) for number, a in enumerate(ticks) for b in ticks[:number])
+    # the title has the density near the axis, as `checks` has it
+    check = density_near_axis(found)
+    name, density, *_ = side.figure.get_suptitle().split("\n")
+    assert name.startswith("R5083.epos: 40,000 ions, ")
+    assert density == (
+        f"near the axis {check.found:.3g} ions per nm³, {check.found / check.expected:.2f} × efficiency / atomic volume"
+    )
+    assert side.figure.get_suptitle().count("\n") == 1 + (not check.good)

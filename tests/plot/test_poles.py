@@ -3,6 +3,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import ZONES, poles, zones
+from apt_evap.plot._labels import legend_below
 
 
 @pytest.fixture
@@ -57,11 +58,25 @@ def test_parts_can_be_left_out_and_names_do_not_overlap(drawn):
     before = len(ax.texts)
     ae.plot.poles(ax, orientation, projection, families=12, zone_families=())
     names = ax.texts[before:]
-    assert len(ax.lines) == 6 and 5 < len(names) < len(places(ax))
+    assert len(ax.lines) == 6 and len(names) == len(places(ax))
     ax.figure.draw_without_rendering()
-    boxes = [text.get_window_extent() for text in names]
+    boxes = [text.get_window_extent() for text in names if text.get_visible()]
+    assert len(boxes) > 5
     overlapping = [a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i]]
     assert not any(overlapping)
+
+
+def test_one_legend_names_the_zone_lines_that_are_seen(drawn):
+    map, ax = drawn
+    other = ae.plot.detector_map(map, ax.figure.add_subplot())
+    for each, families in ((ax, [(1, 1, 0)]), (other, [(1, 1, 0), (1, 0, 0)])):
+        ae.plot.poles(each, ae.Orientation("Ni", (1, 1, 1)), ae.detection.Projection(12.0), zone_families=families)
+    legend_below([ax, other])
+    (legend,) = ax.figure.legends
+    names = [text.get_text() for text in legend.get_texts()]
+    assert sorted(names) == ["poles", "zone lines of ⟨$100$⟩", "zone lines of ⟨$110$⟩"]
+    colors = {handle.get_label(): handle.get_color() for handle in legend.get_lines()}
+    assert colors["zone lines of ⟨$110$⟩"] == ax.lines[0].get_color() != colors["zone lines of ⟨$100$⟩"]
 
 
 def test_a_fit_and_a_run_know_their_orientation_and_projection(drawn, nickel):

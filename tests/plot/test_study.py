@@ -19,8 +19,8 @@ from matplotlib.image import imread
 from rough import ROUGH
 
 import apt_evap as ae
+from apt_evap._common.recorded_warnings import recorded_warnings
 from apt_evap.plot.report.html_page import read_report
-from apt_evap.plot.report.origin import recorded_warnings
 from apt_evap.plot.report.study_report import doubts
 
 

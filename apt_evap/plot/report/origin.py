@@ -2,9 +2,7 @@
 
 import datetime
 import hashlib
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,24 +27,6 @@ def describe_file(path: AnyPath) -> dict[str, Any]:
     with open_for_reading(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]  # an unbuffered file
         return {"name": path.name, "bytes": file.tell(), "sha256": digest}
-
-
-@contextmanager
-def recorded_warnings(hidden: tuple[type[Warning], ...] = ()) -> Iterator[list[Any]]:
-    """Yield a list that receives every warning; those of other classes than `hidden` are also shown as before."""
-    messages: list[Any] = []
-    show = warnings.showwarning
-
-    def record(message: Any, *where: Any, **options: Any) -> None:
-        messages.append(message)
-        if not isinstance(message, hidden):
-            show(message, *where, **options)
-
-    warnings.showwarning = record
-    try:
-        yield messages
-    finally:
-        warnings.showwarning = show
 
 
 def origin(files: Sequence[AnyPath] = (), command: str = "", messages: Sequence[str] = ()) -> dict[str, Any]:
