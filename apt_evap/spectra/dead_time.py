@@ -34,7 +34,8 @@ class DeadTimeLoss:
     def matters(self) -> bool:
         """Whether the losses are above three of their errors, and move the composition by more than its error."""
         clear = any(part > 3 * error for part, error in self.lost.values())
-        return clear and any(abs(value) > self.error[element] for element, value in self.shift.items())
+        # an element alone has 100 at.% without an error, and a shift by rounding
+        return clear and any(abs(value) > max(self.error[element], 1e-6) for element, value in self.shift.items())
 
     def __str__(self) -> str:
         if not self.lost:

@@ -91,6 +91,8 @@ def test_losses_of_the_dead_time_show_in_the_isotopes():
     # pulses that lost an ion count as single: the pairs that remain have fewer 11B than the natural ratio says
     assert part > 5 * error > 0 and losses.matters and losses.shift["B"] > 0
     assert spectrum.dead_time_note() == str(losses)
+    pure = ae.spectrum(hits[hits.mass_to_charge < 20], ["B"])
+    assert pure.losses().lost["B⁺"][0] > 0.1 and pure.dead_time_note() == ""  # an element alone has 100 at.%
     assert f"not corrected for it: with these ions there would be {losses.shift['B']:.2f} at.% more B" in str(losses)
     assert ae.spectrum(hits, ranges=spectrum.ranges()).dead_time_note() == ""  # an ion has no rivals to be clean of
     assert ae.spectrum(ae.Hits(mass_to_charge=hits.mass_to_charge), ["B", "Al"]).dead_time_note() == ""  # no pulses

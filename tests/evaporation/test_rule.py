@@ -84,7 +84,7 @@ def test_two_emitters_may_share_a_rule(small_tip):
 def test_a_run_is_not_resumed_by_another_rule(small_tip, tmp_path, other):
     checkpoint = ae.simulation.Checkpoint(tmp_path / "a.h5", resume=True)
     ae.Simulation(small_tip).run(20, responses=False, progress=False, checkpoint=checkpoint)
-    with pytest.raises(ae.FileError, match=r"other settings: rule\."):
+    with pytest.raises(ae.FileError, match=r"other settings \(rule\."):
         ae.Simulation(small_tip, rule=other).run(40, responses=False, progress=False, checkpoint=checkpoint)
 
 
