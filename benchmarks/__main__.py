@@ -72,7 +72,7 @@ def main(arguments=None):
             spent, code = processor_seconds(words, folder)
             print(f"{name}: {spent:.1f} s of processor, {time.monotonic() - began:.0f} s, exit code {code}", flush=True)
             if not code:
-                known[name] = f"{spent:.1f}"
+                known[name] = f"{spent:.1f}" if spent > 0.1 else f"{spent:.2f}"
                 with TABLE.open("w", newline="") as file:
                     writer = csv.writer(file, lineterminator="\n")
                     writer.writerow(["command", "processor_seconds"])
