@@ -83,11 +83,14 @@ def score_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: 
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label=f"noise-corrected {study.settings.score_name}"
-        if study.settings.allow_noise
-        else study.settings.score_name,
+        label=f"noise-corrected {study.settings.score_name}" if _is_corrected(study) else study.settings.score_name,
     )
     return panels
+
+
+def _is_corrected(study):
+    """Whether the scores are corrected for noise: that of measured densities is not known."""
+    return study.settings.allow_noise and study.measured.is_counts
 
 
 def _mark_optima(study, axes):
@@ -205,7 +208,7 @@ def _default_circle(study):
 
 def _scores(study):
     """Text with the similarities."""
-    corrected = study.settings.allow_noise
+    corrected = _is_corrected(study)
     lines = [
         f"{study.settings.score_name} with the measured map",
         f"in {study.provenance['bins_compared']:,} bins" + ", noise-corrected" * corrected,

@@ -139,6 +139,22 @@ def test_pictures_are_drawn_and_their_size_is_stated(page, seen):
     assert 0.5 < stated * 1e6 / page.stat().st_size < 1
 
 
+def test_poles_and_lines_of_the_pictures_are_named(study, seen):
+    assert study.orientation is not None
+    assert "zone lines of ⟨110⟩; ▬ zone lines of ⟨100⟩; ○ poles, larger for" in seen.text
+
+
+def test_scores_of_densities_are_not_called_corrected(study):
+    """The noise of densities is not known."""
+    bars = [ae.plot.score_matrix(one)[0].figure.axes[-1] for one in (study, replace(study, measured=densities(study)))]
+    assert [bar.get_ylabel() for bar in bars] == ["noise-corrected SSIM", "SSIM"]
+
+
+def densities(study):
+    """The measured map without its numbers of ions."""
+    return replace(study.measured, is_counts=False)
+
+
 @pytest.mark.slow
 def test_only_the_given_figures(study, tmp_path):
     ae.plot.write_study(study, tmp_path / "r.html", figures={"a < b": Figure((1, 1))})
