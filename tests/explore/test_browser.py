@@ -10,12 +10,14 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from rough import ROUGH
 
 import apt_evap as ae
@@ -219,6 +221,16 @@ def test_maps_fill_the_window(page, width):
     }""")
     assert len(sizes) > 10 and min(sizes)[0] >= 12, min(sizes)
     picture(page, f"window_{width}")
+
+
+def test_nothing_of_the_dark_style_is_left_at_the_edges_of_a_figure(page):
+    page.get_by_role("button", name="light", exact=True).click()
+    page.get_by_role("button", name="dark", exact=True).wait_for()
+    page.wait_for_timeout(1000)  # the browser draws
+    x, y = page.evaluate("(({x, y}) => [x, y])(Bokeh.index.find_one(maps[0]).el.getBoundingClientRect())")
+    pixels = imread(BytesIO(page.screenshot()))[..., :3]
+    corner = pixels[int(y) - 2 : int(y) + 10, int(x) - 2 : int(x) + 10]
+    assert (corner > 0.99).all()
 
 
 def test_only_the_address_opens_the_page(served):
