@@ -8,7 +8,7 @@ from typing import Any
 from bokeh.document import Document
 from bokeh.events import DocumentReady
 from bokeh.layouts import column, row
-from bokeh.models import Button, CustomJS, GlobalInlineStyleSheet, Plot, Widget
+from bokeh.models import Button, CustomJS, GlobalInlineStyleSheet, Widget
 
 from apt_evap.explore.code_panel import CodePanel
 from apt_evap.explore.correlation_panel import CorrelationPanel
@@ -272,9 +272,6 @@ class Page:
         self.document.theme = theme(STYLES[0])
         for widget in self.root.select({"type": Widget}):
             widget.stylesheets = [*widget.stylesheets, WIDGETS]
-        for figure in self.root.select({"type": Plot}):
-            # half of the first pixel keeps the colour that was painted before another style
-            figure.styles = {**figure.styles, "clip-path": "inset(1px 0 0 1px)"}
         self.root.styles = page_styles(STYLES[0])
         self.root.stylesheets = [GlobalInlineStyleSheet(css="body { margin: 0; }")]
         self.document.js_on_event(DocumentReady, CustomJS(code=_KEY_B))  # of the first page of a document
