@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.detection.color_limits import common_limits
-from apt_evap.fit.study import Study
+from apt_evap.fit.study import PREDICTED, RULE_OF_METAL, Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, with_default_settings
 from apt_evap.plot.map_figures import detector_map
 
@@ -215,7 +215,8 @@ def _scores(study):
     ]
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
-    lines += [f"{name}: {score}" for name, score in study.baselines.items()]
+    labels = {RULE_OF_METAL: PREDICTED}
+    lines += [f"{labels.get(name, name)}: {score}" for name, score in study.baselines.items()]
     lines.append(f"{study.grid.name}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
     if study.ceiling is not None:
