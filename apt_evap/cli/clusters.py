@@ -39,7 +39,8 @@ def execute(options: argparse.Namespace) -> int:
     if result.choice is not None:
         separation = f"d_max {result.choice.d_max:.3f} nm, N_min {result.settings.n_min}"
         tell(options, f"chosen against random labels: {separation} (p = {result.choice.p_value:.2f})")
-    tell(options, f"{len(result)} clusters, {result.clustered_fraction:.1%} of the solutes are in them")
+    number = f"{len(result)} {'cluster' if len(result) == 1 else 'clusters'}"
+    tell(options, f"{number} with {result.clustered_fraction:.1%} of the solutes")
     if len(result):
         value, error = result.number_density()
         tell(options, f"{value:.3g} ± {error:.2g} per nm^3; {int(result.at_edge.sum())} at the edge count by one half")

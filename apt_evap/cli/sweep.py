@@ -161,10 +161,11 @@ def _tell_counts(options, content):
 
 def _collect(options):
     from apt_evap._common.files import FileError
-    from apt_evap.studies.sweep.collection import collect_sweep
+    from apt_evap.studies.sweep.collection import INDEX, collect_sweep
     from apt_evap.studies.sweep.planning import open_sweep
 
     sweep = open_sweep(options.study)
+    done = "replaced" if (sweep.folder / INDEX).exists() else "wrote"
     result = collect_sweep(
         sweep,
         maps=options.maps,
@@ -185,7 +186,7 @@ def _collect(options):
         tell_json(options, result | {"best": fit.best, "table": fit.rows()})
     else:
         tell_json(options, result)
-    tell(options, f"wrote {', '.join(result['files'])}")
+    tell(options, f"{done} {', '.join(result['files'])}")
     return 0
 
 

@@ -76,7 +76,8 @@ def theme(style: str) -> Theme:
             "attrs": {
                 "Plot": {
                     "background_fill_color": c["panel"],
-                    "border_fill_color": c["paper"],
+                    # that of the page: half of the first pixel would keep the colour painted before another style
+                    "border_fill_color": None,
                     "outline_line_color": c["edge"],
                 },
                 "Grid": {"grid_line_color": c["edge"]},

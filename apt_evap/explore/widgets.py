@@ -57,12 +57,21 @@ button.label = "copied"
 setTimeout(() => { button.label = label }, 1500)
 """
 _SAVE = """
-figures.forEach((fig, k) => Bokeh.index.find_one(fig)?.export("png", true).to_blob().then(blob => {
-  const link = document.createElement("a")
-  link.href = URL.createObjectURL(blob)
-  link.download = `map_${k + 1}.png`
-  link.click()
-}))
+figures.forEach((fig, k) => {
+  const view = Bokeh.index.find_one(fig)
+  if (!view) return
+  const layer = view.export("png", true), context = layer.canvas.getContext("2d")
+  context.resetTransform()
+  context.globalCompositeOperation = "destination-over"  // figures are transparent outside their axes
+  context.fillStyle = getComputedStyle(view.el).getPropertyValue("--paper")
+  context.fillRect(0, 0, layer.canvas.width, layer.canvas.height)
+  layer.to_blob().then(blob => {
+    const link = document.createElement("a")
+    link.href = URL.createObjectURL(blob)
+    link.download = `map_${k + 1}.png`
+    link.click()
+  })
+})
 """
 
 

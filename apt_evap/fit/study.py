@@ -197,8 +197,8 @@ class Study:
             return "the errors are not known without resamples"
         below, above = self.refined.open_ends.get("true_mean", (False, False))
         if below or above:
-            sides = "lower and upper" if below and above else "lower" if below else "upper"
-            return f"the interval of 95 % has no {sides} bound within the grid"
+            sides = "neither a lower nor an upper" if below and above else "no lower" if below else "no upper"
+            return f"the interval of 95 % has {sides} bound within the grid"
         return ""
 
     @property

@@ -70,6 +70,9 @@ def composition_profile(
 ) -> DrawnAxes:
     """Draw a proxigram, or a profile along an axis, with the errors of the counts.
 
+    The bars are intervals of 68 % by the number of atoms in the step. They are those of Wilson, which also have a
+    length where all atoms of a step are of one element: from 50 to 100 % for a single atom.
+
     Parameters
     ----------
     profile : CompositionProfile
@@ -93,10 +96,11 @@ def composition_profile(
     ax = new_figure((6.0, 4.0)).subplots() if ax is None else ax
     for name in names:
         of_element = profile.of(check_choice(name, "elements", profile.elements))
+        low, high = _interval(of_element.fraction, of_element.ions)
+        errors = 100 * np.array([of_element.fraction - low, high - of_element.fraction])
         ax.errorbar(
-            of_element.centres, 100 * of_element.fraction, 100 * of_element.fraction_errors, fmt=".-", capsize=2,
-            label=name.replace("$", r"\$"),
-        )  # fmt: skip
+            of_element.centres, 100 * of_element.fraction, errors, fmt=".-", capsize=2, label=name.replace("$", r"\$")
+        )
     ax.set(xlabel=label, ylabel="atoms [%]", ylim=(0, None))
     ax.legend(fontsize="small")
     set_title(ax, title)
@@ -132,6 +136,14 @@ def truth_comparison(result: TruthComparison, *, title: str | None = None) -> ND
     if title:
         figure.suptitle(title, parse_math=False)
     return axes
+
+
+def _interval(fraction, atoms):
+    """Ends of the interval of 68 % for a fraction of a number of atoms: Wilson, J. Am. Stat. Assoc. 22, 209 (1927)."""
+    middle = (fraction * atoms + 0.5) / (atoms + 1)
+    half = np.sqrt(fraction * (1 - fraction) * atoms + 0.25) / (atoms + 1)
+    # a rounding error below zero would be refused as the length of a bar
+    return np.minimum(middle - half, fraction), np.maximum(middle + half, fraction)
 
 
 def _side(ax: Axes, result) -> None:

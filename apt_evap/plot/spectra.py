@@ -12,6 +12,7 @@ from apt_evap.plot._figure import DrawnAxes, ion_label, new_figure, raised_charg
 from apt_evap.plot._labels import label_peaks
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.spectra.candidate_ions import highest_charge
 from apt_evap.spectra.mass_ranges import Ranges
 from apt_evap.spectra.mass_spectrum import Spectrum
 
@@ -24,7 +25,6 @@ _SHARP, _SURROUNDINGS = 0.05, 2.0  # half width of a peak, and of the spectrum a
 _TAIL = 0.004  # of the mass, by which energy deficits may shift the top of a peak
 _SIGNIFICANT = 5.0  # standard deviations of a peak above the ions around it
 _FEWEST = 4.0  # expected ions of an isotope with a label
-_HIGHEST_CHARGE = 4
 
 
 @with_default_settings
@@ -56,7 +56,8 @@ def spectrum(
         more than 0.1 % of the ions.
     elements : sequence of str, optional
         Elements of `ISOTOPES` to label: peaks of their isotopes with a charge for which the most abundant isotope has a
-        peak. By default those of the runs; () for none.
+        peak, up to the highest charge that `composition` tries for the element. By default those of the runs; () for
+        none.
     ranges : Ranges, optional
         Drawn with their names in place of the peaks of a Spectrum.
 
@@ -266,7 +267,7 @@ def _label_isotopes(ax, elements, edges, counts, heights):
     highest = np.max(heights, axis=0)
     mains, others = [], []
     for element in elements:
-        for charge in range(1, min(list(ISOTOPES).index(element) + 1, _HIGHEST_CHARGE) + 1):  # of H only H+
+        for charge in range(1, highest_charge(element) + 1):
             isotopes = [
                 (highest[_bins_of_peak(edges, mass / charge)].max(), mass / charge, (element, charge, mass))
                 for mass, _ in _visible_isotopes(element, charge, counts, edges)

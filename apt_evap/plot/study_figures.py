@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_number
 from apt_evap.detection.color_limits import common_limits
-from apt_evap.fit.study import Study
+from apt_evap.fit.study import PREDICTED, RULE_OF_METAL, Study
 from apt_evap.plot._figure import OUTSIDE, add_colorbar, new_figure, with_default_settings
 from apt_evap.plot.map_figures import detector_map
 
@@ -83,11 +83,14 @@ def score_matrix(study: Study, axes: Sequence[Axes] | None = None, *, colormap: 
     add_colorbar(
         [ax.images[0] for ax in panels],
         list(panels),
-        label=f"noise-corrected {study.settings.score_name}"
-        if study.settings.allow_noise
-        else study.settings.score_name,
+        label=f"noise-corrected {study.settings.score_name}" if _is_corrected(study) else study.settings.score_name,
     )
     return panels
+
+
+def _is_corrected(study):
+    """Whether the scores are corrected for noise: that of measured densities is not known."""
+    return study.settings.allow_noise and study.measured.is_counts
 
 
 def _mark_optima(study, axes):
@@ -205,14 +208,15 @@ def _default_circle(study):
 
 def _scores(study):
     """Text with the similarities."""
-    corrected = study.settings.allow_noise
+    corrected = _is_corrected(study)
     lines = [
         f"{study.settings.score_name} with the measured map",
         f"in {study.provenance['bins_compared']:,} bins" + ", noise-corrected" * corrected,
     ]
     if study.registration.doubtful:
         lines.insert(0, f"THE REGISTRATION IS DOUBTFUL: correlation {study.registration.score:.2f}\n")
-    lines += [f"{name}: {score}" for name, score in study.baselines.items()]
+    labels = {RULE_OF_METAL: PREDICTED}
+    lines += [f"{labels.get(name, name)}: {score}" for name, score in study.baselines.items()]
     lines.append(f"{study.grid.name}: {study.optimum.score}")
     lines.append(f"gain over unperturbed: {study.gain}")
     if study.ceiling is not None:

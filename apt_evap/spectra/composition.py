@@ -87,7 +87,7 @@ class Amounts:
     def composition(self, unexplained: float, refused: str = "") -> Composition:
         """Composition of these ions; none where too much is unexplained."""
         if not refused and unexplained > MOST_UNEXPLAINED:
-            refused = f"{unexplained:.0%} of the ions in peaks are unexplained, expected at most {MOST_UNEXPLAINED:.0%}"
+            refused = f"{unexplained:.1%} of the ions in peaks are unexplained, more than {MOST_UNEXPLAINED:.0%}"
         numbers = _atoms_of(self.atoms, self.ions)
         total = sum(numbers.values())
         if not refused and not total > 0:

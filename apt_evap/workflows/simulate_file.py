@@ -176,17 +176,17 @@ def simulate(
 
     n_ions = config.n_ions
     cost = estimate_cost(config, 1)
+    stored = Checkpoint(path, checkpoint, resume=resume, overwrite=overwrite)
+    n_previous = stored.ions_there() if resume else 0
     if seconds is not None:
         note(f"at most {n_ions:,} ions, as many as the time allows")
-    else:
+    elif n_previous != n_ions:
         note(f"{cost}" if cost.hours is None else f"{cost} of one thread")
     note("building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=threads)
     note(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
     began = time.perf_counter()
-    stored = Checkpoint(path, checkpoint, resume=resume, overwrite=overwrite)
     replaced, unfinished = path.exists(), stored.unfinished.exists()
-    n_previous = stored.ions_there() if resume else 0
     if 0 < n_previous < n_ions:
         note(f"resumed at {n_previous:,} of {n_ions:,} ions")
     left = None if seconds is None else _less(seconds, time.monotonic() - called)

@@ -32,7 +32,7 @@ def test_clusters_of_a_file(folder, capsys):
     said = ae.measures.PointCloud.of(ae.read("R1.pos"), ae.io.read_ranges("R1.rrng")).clusters("Cu", 0.5, 20)
     value, error = said.fractions()["Cu"]
     every = said.atoms.sum(axis=0)[said.cloud.elements.index("Cu")] / said.atoms.sum()
-    assert "1 clusters" in out and f"Cu {100 * value:.2f} ± {100 * error:.2f} %" in out
+    assert "1 cluster with " in out and f"Cu {100 * value:.2f} ± {100 * error:.2f} %" in out
     assert f"near solutes by choice: Al {100 - 100 * every:.2f} %, Cu {100 * every:.2f} %\n" in out
     assert main([*"clusters R1.pos --ranges R1.rrng --solute Cu --d-max 0.5 --envelope 0".split()]) == 0
     assert "clusters: no composition, as no other ion is between their solutes" in capsys.readouterr().out

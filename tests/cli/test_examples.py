@@ -135,6 +135,8 @@ def test_the_settings_files_work(name, folder, capsys):
         case "sweep.toml":
             assert all(main(["sweep", action, name]) == 0 for action in ("plan", "work", "collect"))
             assert "2 of 2 points are done" in capsys.readouterr().out and Path("sweep/report.html").exists()
+            assert main(["sweep", "collect", name]) == 0
+            assert f"replaced {folder / 'sweep' / 'index.csv'}, " in capsys.readouterr().out
         case "dataset.toml":
             assert main(["dataset", name, "-o", "set", "--quiet"]) == 0
             assert main(["dataset", "set"]) == 0

@@ -10,12 +10,14 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 from rough import ROUGH
 
 import apt_evap as ae
@@ -219,6 +221,27 @@ def test_maps_fill_the_window(page, width):
     }""")
     assert len(sizes) > 10 and min(sizes)[0] >= 12, min(sizes)
     picture(page, f"window_{width}")
+
+
+def test_nothing_of_the_dark_style_is_left_at_the_edges_of_a_figure(page):
+    page.get_by_role("button", name="light", exact=True).click()
+    page.get_by_role("button", name="dark", exact=True).wait_for()
+    page.wait_for_timeout(1000)  # the browser draws
+    x, y = page.evaluate("(({x, y}) => [x, y])(Bokeh.index.find_one(maps[0]).el.getBoundingClientRect())")
+    pixels = imread(BytesIO(page.screenshot()))[..., :3]
+    page.get_by_role("button", name="dark", exact=True).click()  # the session is that of the other tests, too
+    page.get_by_role("button", name="light", exact=True).wait_for()
+    corner = pixels[int(y) - 2 : int(y) + 10, int(x) - 2 : int(x) + 10]
+    assert (corner > 0.99).all()
+
+
+def test_saved_pictures_have_the_colour_of_the_page(page, tmp_path):
+    with page.expect_download() as first:
+        page.get_by_role("button", name="save pictures", exact=True).click()
+    first.value.save_as(tmp_path / "map.png")
+    pixels = imread(tmp_path / "map.png")
+    assert (pixels[..., 3] == 1).all()
+    np.testing.assert_allclose(255 * pixels[[0, -1], [0, -1], :3], [(21, 24, 28)] * 2, atol=1)  # dark
 
 
 def test_only_the_address_opens_the_page(served):

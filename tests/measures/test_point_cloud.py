@@ -6,6 +6,7 @@ from rough import ROUGH
 from scipy.special import erf
 
 import apt_evap as ae
+from apt_evap.measures.interface import CompositionProfile
 
 RADIUS, BLUR = 2.0, 0.3  # nm
 
@@ -271,6 +272,13 @@ def test_pictures():
     x, y = line.get_data()
     inner = y[(x > -1.2) & (x < -0.6)].mean()
     assert inner == pytest.approx(80 - 3, abs=4)  # per cent; two and more blurs inside, 500 ions: three errors of 1.8
+    atoms = np.array([[0, 1], [80, 20], [0, 0]])
+    profile = CompositionProfile(np.arange(4.0), ("Al", "Cu"), atoms, np.zeros(101))
+    ax = ae.plot.composition_profile(profile, "Cu")
+    (segments,) = (container[2][0].get_segments() for container in ax.containers)
+    assert segments[0][:, 1].tolist() == [50, 100]  # a single atom
+    # (20.5 ± sqrt(16.25)) / 101: of many atoms nearly one standard deviation, 4 %
+    np.testing.assert_allclose(segments[1][:, 1], [16.3058, 24.2882], atol=1e-4)
     with pytest.raises(ValueError, match="elements must be one of Al, Cu, got 'Ag'"):
         ae.plot.composition_profile(cloud.profile(), "Ag")
     with pytest.raises(ValueError, match="result must be Clusters"):

@@ -429,6 +429,12 @@ def test_isotopes_are_labelled_where_there_are_peaks():
     assert not plot.spectrum(hits, limits=(10, 30)).texts
     low, high = plot.spectrum(hits).get_xlim()
     assert 12 < low < 14 and 18 < high < 20  # without the background
+    # 58Ni4+ and 60Ni4+ would be at 14.48 and 14.98 Da, but nickel has no more than two charges
+    hits = ae.Hits(mass_to_charge=np.repeat([13.99, 14.48, 14.98, 28.97, 29.97], [90_000, 5000, 3000, 700, 300]))
+    texts = {text.get_text() for text in plot.spectrum(hits, elements=["Si", "Ni"], limits=(10, 32)).texts}
+    assert texts == {f"$^{{{mass}}}$Si$^{{2{{+}}}}$" for mass in (28, 29, 30)} | {
+        f"$^{{{mass}}}$Ni$^{{2{{+}}}}$" for mass in (58, 60)
+    }
 
 
 def overlapping(texts):

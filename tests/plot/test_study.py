@@ -16,6 +16,7 @@ from fits import fit_energies
 from html_reader import Reader
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.text import Text
 from rough import ROUGH
 
 import apt_evap as ae
@@ -137,6 +138,28 @@ def test_pictures_are_drawn_and_their_size_is_stated(page, seen):
         assert image.shape[:2] == size and image[..., :3].std() > 0.05
     stated = float(re.search(r"Pictures: (\S+) MB with 100 dpi", seen.text)[1])
     assert 0.5 < stated * 1e6 / page.stat().st_size < 1
+
+
+def test_poles_and_lines_of_the_pictures_are_named(study, seen):
+    assert study.orientation is not None
+    assert "zone lines of ⟨110⟩; ▬ zone lines of ⟨100⟩; ○ poles, larger for" in seen.text
+
+
+def test_scores_of_densities_are_not_called_corrected(study):
+    """The noise of densities is not known."""
+    bars = [ae.plot.score_matrix(one)[0].figure.axes[-1] for one in (study, replace(study, measured=densities(study)))]
+    assert [bar.get_ylabel() for bar in bars] == ["noise-corrected SSIM", "SSIM"]
+
+
+def test_the_predicted_roll_up_has_its_name_beside_the_maps(study):
+    known = replace(study, baselines={**study.baselines, "rule of the metal": study.optimum.score})
+    texts = [text.get_text() for text in ae.plot.side_by_side(known)[0].figure.findobj(Text)]
+    assert "roll-up predicted for the metal: " in " ".join(texts).replace("\n", " "), texts
+
+
+def densities(study):
+    """The measured map without its numbers of ions."""
+    return replace(study.measured, is_counts=False)
 
 
 @pytest.mark.slow

@@ -145,7 +145,8 @@ def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
         collection_module, "fit_tips", lambda *args, **options: fit_tips(*args, registration=known, **options)
     )
     assert main(["sweep", "collect", str(tmp_path / "study.toml")]) == 0
-    assert f"best '{sweep.keys[1]}'" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert f"best '{sweep.keys[1]}'" in out and f"wrote {sweep.folder / 'index.csv'}, " in out
     with open(sweep.folder / "fit.csv", newline="") as file:
         best = next(csv.DictReader(file))
     assert best["key"] == sweep.keys[1] and best["tip.axis"] == "[1, 1, 1]"

@@ -5,12 +5,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from apt_evap import plot
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.plot._figure import OUTSIDE
-from apt_evap.plot.report.html_page import Page, switched
+from apt_evap.plot.report.html_page import Page, escape, switched
 
 _LEFT, _RIGHT, _BELOW, _ABOVE = 0.7, 1.05, 0.55, 0.35  # margins [inch]: labels, colour bar, labels, title
 
@@ -43,7 +44,7 @@ def blinking_pictures(
     side = width - _LEFT - _RIGHT
     up = side * (top - bottom) / (right - left)
     height = up + _BELOW + _ABOVE
-    pictures = []
+    pictures, marks = [], {}
     for title, map in maps.items():
         # fixed places of axes and colour bar: both pictures agree to the pixel
         figure = Figure(figsize=(width, height))
@@ -54,9 +55,21 @@ def blinking_pictures(
         plot.detector_map(map, ax, limits=limits, colorbar=False, caption=False)
         if crystal is not None:
             plot.poles(ax, *crystal, region=first)
+            marks |= {label: line for line, label in zip(*ax.get_legend_handles_labels(), strict=True)}
         ax.set(xlim=(left, right), ylim=(bottom, top), facecolor=OUTSIDE)
         ax.set_title(title, fontsize="medium", parse_math=False)
         bar = figure.add_axes(((_LEFT + side + 0.15) / width, _BELOW / height, 0.15 / width, up / height))
         figure.colorbar(ax.images[0], cax=bar, label="hits per area / mean")
         pictures.append(page.picture(figure, alt=title))
-    return switched(pictures, beside=True)
+    return "\n".join([switched(pictures, beside=True), *([_legend(marks)] if marks else [])])
+
+
+def _legend(marks):
+    """Names of the poles and zone lines on the pictures, as HTML."""
+    names = []
+    for label, mark in marks.items():
+        if isinstance(mark, Line2D):
+            names.append(f'<span style="color: {mark.get_color()}">&#9644;</span> {escape(label.replace("$", ""))}')
+        else:
+            names.append(f"&#9675; {escape(label)}, larger for a larger spacing of the planes")
+    return f'<p class="note">Of the simulated crystal, on both maps: {"; ".join(names)}.</p>'
