@@ -312,7 +312,7 @@ def test_a_study_is_a_folded_table_in_a_notebook(study):
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.MapWarning")  # few ions
 def test_the_report_of_the_default_objective(small_tip, made_once, tmp_path):
     """A map with a pole is compared after folding, and the report has the name and the numbers of this score."""
-    run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1500]
+    run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1800]
     measured = run.hits(ae.RollUp(0.2)).within_circle(60.0).map(bins=24, extent=(-60, 60, -60, 60))
     here = ae.Registration(0.0, 1.0, (0.0, 0.0))
     energies = {"means": (0.1, 0.2, 0.3), "relative_spreads": (0.5,)}
