@@ -139,7 +139,7 @@ RUNS = {
     "proxigram": [("proxigram", "ions.epos", *RANGES, "--solute", "Al", "--isovalue", "0.2")],
     "composition": [("composition", "ions.epos"), ("composition", "ions.epos", *RANGES)],
     "index": [("index", "ions.epos", "--element", "Ni", "--scales", "50,50")],
-    "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50")],
+    "start": [("start", "ions.epos", "--element", "Ni", "--scales", "50,50", "-o", "started.toml")],
     "export": [("export", "run.h5", "-o", "x.pos"), ("export", "ions.epos", "-o", "x.csv")],
     "reconstruct": [
         ("reconstruct", "ions.epos", *OF_NICKEL),

@@ -140,7 +140,7 @@ def potentials_of(emitter):
 @pytest.mark.parametrize("rule", CONSTANT, ids=NAMES)
 def test_potentials_are_kept_during_the_events(small_tip, rule, tolerance, bound):
     rule = replace(rule, tolerance=tolerance)
-    settings = ae.evaporation.ChargeSettings(opening_angle=0.2, update_radius=40.0)  # the whole specimen
+    settings = ae.evaporation.ChargeSettings(opening_angle=0.2, relaxation_angle=0.2, update_radius=40.0)  # all atoms
     emitter = ae.evaporation.Emitter(small_tip, 1000.0, rule=rule, settings=settings)
     for number, batch in enumerate(emitter.advance(60, batch_size=20)):
         top = emitter.tip.positions[batch.site[-1]]
