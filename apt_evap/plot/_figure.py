@@ -19,6 +19,8 @@ from matplotlib.image import AxesImage
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
+from apt_evap._common.types import Floats, Integers
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -185,3 +187,11 @@ def new_figure(size: tuple[float, float]) -> Figure:
     pyplot = sys.modules.get("matplotlib.pyplot")
     make = _Figure if pyplot is None else partial(pyplot.figure, FigureClass=_Figure)
     return make(figsize=size, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06), dpi=150)
+
+
+def interval_of_fraction(fraction: Floats, number: Floats | Integers) -> tuple[Floats, Floats]:
+    """Ends of the interval of 68 % for a fraction of a number of ions: Wilson, J. Am. Stat. Assoc. 22, 209 (1927)."""
+    middle = (fraction * number + 0.5) / (number + 1)
+    half = np.sqrt(fraction * (1 - fraction) * number + 0.25) / (number + 1)
+    # a rounding error below zero would be refused as the length of a bar
+    return np.minimum(middle - half, fraction), np.maximum(middle + half, fraction)

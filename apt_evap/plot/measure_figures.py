@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from apt_evap._common.validation import check_choice, check_kind, check_sequence
 from apt_evap.measures.interface import CompositionProfile
 from apt_evap.measures.point_cloud import Clusters
-from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default_settings
+from apt_evap.plot._figure import DrawnAxes, interval_of_fraction, new_figure, set_title, with_default_settings
 from apt_evap.reconstruction.truth_comparison import TruthComparison
 
 _DOTS = 20_000  # solutes from the side: more hide each other
@@ -96,7 +96,7 @@ def composition_profile(
     ax = new_figure((6.0, 4.0)).subplots() if ax is None else ax
     for name in names:
         of_element = profile.of(check_choice(name, "elements", profile.elements))
-        low, high = _interval(of_element.fraction, of_element.ions)
+        low, high = interval_of_fraction(of_element.fraction, of_element.ions)
         errors = 100 * np.array([of_element.fraction - low, high - of_element.fraction])
         ax.errorbar(
             of_element.centres, 100 * of_element.fraction, errors, fmt=".-", capsize=2, label=name.replace("$", r"\$")
@@ -136,14 +136,6 @@ def truth_comparison(result: TruthComparison, *, title: str | None = None) -> ND
     if title:
         figure.suptitle(title, parse_math=False)
     return axes
-
-
-def _interval(fraction, atoms):
-    """Ends of the interval of 68 % for a fraction of a number of atoms: Wilson, J. Am. Stat. Assoc. 22, 209 (1927)."""
-    middle = (fraction * atoms + 0.5) / (atoms + 1)
-    half = np.sqrt(fraction * (1 - fraction) * atoms + 0.25) / (atoms + 1)
-    # a rounding error below zero would be refused as the length of a bar
-    return np.minimum(middle - half, fraction), np.maximum(middle + half, fraction)
 
 
 def _side(ax: Axes, result) -> None:

@@ -12,7 +12,7 @@ from apt_evap._common.types import Integers
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
-from apt_evap.plot._figure import add_colorbar, new_figure, set_title, with_default_settings
+from apt_evap.plot._figure import add_colorbar, interval_of_fraction, new_figure, set_title, with_default_settings
 from apt_evap.plot.map_figures import binned
 from apt_evap.reconstruction.consistency import density_near_axis
 from apt_evap.reconstruction.reconstructed import Reconstruction
@@ -100,7 +100,7 @@ def reconstruction(
         _density(profile, result)
         every = slice(None, None, -(-len(result) // _POINTS))  # many more than the pixels of the picture
         last.plot(result.depths[every], result.radii[every], color="C0")
-        last.set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]")
+        last.set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]", ylim=(0, None))
     lines = _description(result)
     if title is not None:
         lines[0] = f"{title}: {lines[0]}"
@@ -207,9 +207,10 @@ def _fractions(ax: Axes, result, names, species):
     number = np.stack([np.histogram(depths[species[near] == index], edges)[0] for index in range(len(names))])
     with np.errstate(invalid="ignore", divide="ignore"):
         fraction = number / number.sum(axis=0)
-        error = np.sqrt(fraction * (1 - fraction) / number.sum(axis=0))
+        low, high = interval_of_fraction(fraction, number.sum(axis=0))
     for index, _name in enumerate(names):
-        ax.errorbar((edges[1:] + edges[:-1]) / 2, fraction[index], error[index], fmt=".-", color=_COLORS[index])
+        errors = fraction[index] - low[index], high[index] - fraction[index]
+        ax.errorbar((edges[1:] + edges[:-1]) / 2, fraction[index], errors, fmt=".-", color=_COLORS[index])
     ax.set(xlabel="depth z [nm]", ylabel="fraction of the ions near the axis", ylim=(0, None))
 
 

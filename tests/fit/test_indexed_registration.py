@@ -120,7 +120,7 @@ def registered(run20, monkeypatch):
 def test_a_comparison_registers_by_the_indexing(registered):
     lines, registration = registered(indexed(NEAR_111, 77.0))
     assert registration.method == "start"
-    scale = "60.0 mm/rad in the centre of the map and at its rim"
+    scale = "60.0 mm/rad in the centre and at the rim"
     assert lines == [f"the map shows [0.35 0.53 0.77], rotation 77.0°, {scale}, where the run is registered"]
 
 

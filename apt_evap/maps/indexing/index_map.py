@@ -171,8 +171,8 @@ class Candidate:
     def __str__(self):
         axis = " ".join(f"{index:.2f}" for index in self.orientation.axis)
         change = round(100 * self.rim_change)
-        rim = f", {abs(change)} % {'more' if change > 0 else 'less'} at its rim" if change else " and at its rim"
-        scale = f"{self.projection.scale:.1f} mm/rad in the centre of the map"
+        rim = f", {abs(change)} % {'more' if change > 0 else 'less'} at the rim" if change else " and at the rim"
+        scale = f"{self.projection.scale:.1f} mm/rad in the centre"
         return f"[{axis}], rotation {self.orientation.rotation:.1f}°, {scale}{rim}"
 
 
