@@ -212,6 +212,11 @@ class Spectrum:
         refused = ""
         if number is not None and number < FEWEST_OF_COMPOSITION:
             refused = f"{number:,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
+        elif self.ranged and self.unexplained_part > MOST_UNEXPLAINED:
+            refused = (
+                f"{self.unexplained_part:.1%} of the ions in ranges are not those that the ranges name, more than "
+                f"{MOST_UNEXPLAINED:.0%}; without ranges the isotopes name the peaks"
+            )
         return amounts.composition(self.unexplained_part, refused)
 
     def candidates(self, mass: float) -> tuple[str, ...]:

@@ -253,6 +253,7 @@ def test_ranges_count_only_their_ions_and_name_those_they_do_not_explain():
     result = ae.spectrum(hits, ranges=ranges)
     assert {ion.formula for ion in result.ions} == {"Si", "Al", "Cr2O"}
     assert {misfit.name for misfit in result.misfits} == {"Cr2O"} and result.unexplained_part > 0.3
+    assert "not those that the ranges name, more than 10%; without ranges" in result.composition.refused
     assert "no composition" in str(result)
     right = ae.spectra.Ranges(
         ("Si", "Al", "Ni", "Ni", "Ni"), low, high, composition=[{"Si": 1}, {"Al": 1}, *[{"Ni": 1}] * 3]
