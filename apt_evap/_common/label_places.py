@@ -29,7 +29,7 @@ def place_labels(
     taken : iterable of tuple of float
         Boxes of what is drawn already.
     """
-    arrays = [np.array(list(each), dtype=float) for each in options]  # (options, boxes, 4)
+    arrays = [np.array(list(boxes), dtype=float) for boxes in options]  # (options, boxes, 4)
     return _placed(options, arrays, area, np.array(list(taken), dtype=float).reshape(-1, 4))
 
 
@@ -89,7 +89,7 @@ def place_above(
         _above(peak, size, np.delete(peaks[:, 0], number), area, highest)
         for number, (peak, size) in enumerate(zip(peaks, sizes, strict=True))
     ]
-    arrays, covered = [np.array(each) for each in options], np.array(list(taken), dtype=float).reshape(-1, 4)
+    arrays, covered = [np.array(boxes) for boxes in options], np.array(list(taken), dtype=float).reshape(-1, 4)
     numbers = list(range(len(options)))
     # labels of near peaks often find places like stairs
     orders = [numbers, sorted(numbers, key=lambda k: -peaks[k, 0]), sorted(numbers, key=lambda k: peaks[k, 0])]

@@ -75,6 +75,8 @@ def say_losses(options: argparse.Namespace, result: Any) -> None:
     """Say whether losses by dead time move the composition by more than its error."""
     from apt_evap.cli._output import say
 
+    if result.ranged or result.composition.refused:  # nothing to say: the pulses of a large file are not read
+        return
     if text := result.dead_time_note(_alone_of(options) if result.hits.pulse_id is None else None):
         say("note", text)
 

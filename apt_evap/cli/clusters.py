@@ -50,10 +50,9 @@ def execute(options: argparse.Namespace) -> int:
             )
             tell(options, f"{name}: {listed or 'no composition, as no other ion is between their solutes'}")
         atoms = result.atoms.sum(axis=0)
-        listed = ", ".join(
-            f"{name} {100 * x:.2f} %" for name, x in zip(cloud.elements, atoms / atoms.sum(), strict=True)
-        )
-        tell(options, f"all ions after envelope and erosion, which are near solutes by choice: {listed}")
+        if (total := atoms.sum()) > 0:  # erosion may leave none
+            listed = ", ".join(f"{name} {100 * n / total:.2f} %" for name, n in zip(cloud.elements, atoms, strict=True))
+            tell(options, f"all ions after envelope and erosion, which are near solutes by choice: {listed}")
     tell(options, done)
     tell_json(options, {"wrote": str(picture), "file": options.file, "ions": len(cloud)} | result.to_dict())
     return 0
