@@ -705,9 +705,10 @@ def _judged(measured, crystal, results, weights, n, contradiction):
         reason = f"counts and local contrast fit it better than any other orientation or scale ({numbers})"
     else:
         several = int(np.count_nonzero(weights > weights[0] - DECIDED))
+        equal = {2: "candidates 1 and 2", 3: "candidates 1 to 3"}.get(several, f"{several} orientations or scales")
         reason = (
-            f"{several} orientations or scales explain the map about equally well ({numbers}); more ions, bounds of "
-            "the scale or a marked pole would help"
+            f"{equal} explain the map about equally well ({numbers}); more ions, bounds of the scale or a marked pole "
+            "would help"
         )
     return Indexing(measured, candidates, decided, reason)
 
