@@ -240,6 +240,7 @@ def test_densities_are_indexed_as_counts_are():
     density = ae.DetectorMap.from_array(np.where(map.mask, map.density, np.nan), map.x_edges, map.y_edges)
     found = ae.index(density, "Ni", distance=90.0)  # all patterns, half angles of 27 to 50 degrees
     assert found.decided and off(found.best, orientation) < 0.5
+    assert "flight length" not in found.reason  # which was given
 
 
 def test_marks_of_a_wrong_form_are_refused():

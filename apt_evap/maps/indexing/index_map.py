@@ -407,6 +407,8 @@ def index(
     >>> found = ae.index(simulated, "Ni")
     >>> found.verdict, f"{found.best.projection.scale:.0f} mm/rad"
     ('indexed', '60 mm/rad')
+    >>> found.reason.partition("its scale is that of ")[2]
+    'a flight length of 72 to 132 mm: if yours is another one, give it (distance, --distance)'
     """
     material = as_material(material)
     if isinstance(measured, Hits):
@@ -429,6 +431,7 @@ def index(
     except UnusableMap as error:
         return Indexing(measured, (), False, str(error))
     check_places(marks, measured, disc.radius)
+    unbounded = scales is None and distance is None
     scales, bounds = _scales(disc, scales, distance, start)
     crystal = _Crystal(view, material, patterns, scales, bounds, marks)
     told = progress or (lambda part: None)
@@ -448,8 +451,15 @@ def index(
         if start is not None:
             return replace(result, decided=False, reason="refined from a given orientation, others were not searched")
         if result.decided and not marks:
-            return _checked(result, crystal, different[0], dispersion, float(weights[0]), told)
-        return result
+            result = _checked(result, crystal, different[0], dispersion, float(weights[0]), told)
+    if result.decided and unbounded:
+        # a single pole that the emission blurs may fit at a wrong scale: a user knows the instrument
+        low, high = (factor * result.best.projection.scale for factor in (LEAST_COMPRESSION, LARGEST_COMPRESSION))
+        return replace(result, reason=(
+            f"{result.reason}; its scale is that of a flight length of {low:.0f} to {high:.0f} mm: if yours is another "
+            "one, give it (distance, --distance)"
+        ))  # fmt: skip
+    return result
 
 
 class _Crystal:
