@@ -38,6 +38,10 @@ from apt_evap.simulation.locks import FileLock
 from apt_evap.spectra import mass_spectrum
 from apt_evap.spectra.mass_spectrum import spectrum
 
+DRAWN = (  # of an artist of Matplotlib: what it shows
+    *("get_text", "get_xydata", "get_array", "get_clim", "get_extent", "get_offsets", "get_paths", "get_path"),
+    *("get_color", "get_facecolor", "get_edgecolor", "get_alpha", "get_visible", "get_xlim", "get_ylim"),
+)
 PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
@@ -227,6 +231,30 @@ def blank_pictures(monkeypatch, rough_layout):
     """Pictures are written with nothing on them: for tests of all but pictures, which take a second each."""
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))
+
+
+def hash_of_figure(figure):
+    """Hash of what a figure draws: the values, texts, colours and limits of all its artists."""
+    parts = []
+    for artist in figure.findobj():
+        parts.append(type(artist).__name__.encode())
+        for name in DRAWN:
+            value = getattr(artist, name, tuple)()
+            for each in value if isinstance(value, list) else [value]:
+                each = np.asarray(getattr(each, "vertices", each))
+                parts.append(repr(each.tolist()).encode() if each.dtype == object else each.tobytes())
+    return hash_of(*parts)
+
+
+@pytest.fixture
+def hashed_pictures(monkeypatch):
+    """Pictures are written with the hash of what they show: for tests that compare two, without drawing both."""
+    save = Figure.savefig
+
+    def save_hash(figure, *args, metadata, **options):
+        save(Figure((1, 1)), *args, metadata=metadata | {"Description": hash_of_figure(figure)}, **options)
+
+    monkeypatch.setattr(Figure, "savefig", save_hash)
 
 
 @pytest.fixture
