@@ -124,7 +124,10 @@ def test_blocks_give_the_answers_of_the_whole_file(tmp_path, monkeypatch, capsys
     whole = []
     for rows in (None, *SIZES):
         blocks_of(rows)
-        given = [answers(capsys, "info", *words, "--json"), answers(capsys, "export", *words, "-o", "b.epos", "--force")]
+        given = [
+            answers(capsys, "info", *words, "--json"),
+            answers(capsys, "export", *words, "-o", "b.epos", "--force"),
+        ]
         given.append((tmp_path / "b.epos").read_bytes())
         given.append(answers(capsys, "export", *words, "-o", "b.pos", "--force"))
         given.append((tmp_path / "b.pos").read_bytes() if (tmp_path / "b.pos").exists() else b"")
