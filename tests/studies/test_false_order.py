@@ -7,11 +7,11 @@ import apt_evap as ae
 
 
 @pytest.fixture(scope="module")
-def alloy():
+def alloy(made_once):
     nickel = ae.material("Ni")
     phase = ae.specimen.Phase("alloy", nickel, solutes={"Al": 0.1}, evaporation_field=nickel.evaporation_field)
     tip = ae.Tip(phases=[phase], apex_radius=3.0, axis=(1, 1, 1), shank_length=3.0, seed=1, offset_seed=1)
-    return ae.Simulation(tip, seed=1, n_threads=1).run(3000, [ae.Unperturbed()], responses=False, progress=False)
+    return made_once(tip, 3000, [ae.Unperturbed()], responses=False, seed=1, n_threads=1)
 
 
 @pytest.mark.slow
