@@ -1,5 +1,6 @@
 """Small specimens, made once for all tests, and runs, made once for all tests until what computes them changes."""
 
+import ast
 import gc
 import hashlib
 import os
@@ -7,6 +8,7 @@ import pickle
 import shutil
 import signal
 import sys
+from functools import cache
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every processor has a worker already
@@ -82,13 +84,25 @@ def hash_of(*parts):
     return hashed.hexdigest()[:24]
 
 
+@cache
+def code_of(path):
+    """Bytes of a file; of Python the code alone, since comments and docstrings change no run."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
+
+
 def kept_folder(config, tmp_path_factory, name, packages):
     """Folder of what these packages compute: it outlives the tests, and goes when their code has changed."""
     if not hasattr(config, "cache"):  # without the plugin of pytest
         return tmp_path_factory.mktemp(name)
     package = Path(ae.__file__).parent
     paths = [path for part in packages for path in sorted((package / part).rglob("*")) if path.is_file()]
-    sources = [path.read_bytes() for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
+    sources = [code_of(path) for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
     folder = config.cache.mkdir(name) / hash_of(*sources)
     folder.mkdir(exist_ok=True)
     for other in folder.parent.iterdir():
