@@ -1,5 +1,6 @@
 """Small specimens, made once for all tests, and runs, made once for all tests until what computes them changes."""
 
+import ast
 import gc
 import hashlib
 import os
@@ -7,6 +8,7 @@ import pickle
 import shutil
 import signal
 import sys
+from functools import cache
 from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # before NumPy is imported: every processor has a worker already
@@ -38,6 +40,10 @@ from apt_evap.simulation.locks import FileLock
 from apt_evap.spectra import mass_spectrum
 from apt_evap.spectra.mass_spectrum import spectrum
 
+DRAWN = (  # of an artist of Matplotlib: what it shows
+    *("get_text", "get_xydata", "get_array", "get_clim", "get_extent", "get_offsets", "get_paths", "get_path"),
+    *("get_color", "get_facecolor", "get_edgecolor", "get_alpha", "get_visible", "get_xlim", "get_ylim"),
+)
 PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
@@ -78,13 +84,25 @@ def hash_of(*parts):
     return hashed.hexdigest()[:24]
 
 
+@cache
+def code_of(path):
+    """Bytes of a file; of Python the code alone, since comments and docstrings change no run."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
+
+
 def kept_folder(config, tmp_path_factory, name, packages):
     """Folder of what these packages compute: it outlives the tests, and goes when their code has changed."""
     if not hasattr(config, "cache"):  # without the plugin of pytest
         return tmp_path_factory.mktemp(name)
     package = Path(ae.__file__).parent
     paths = [path for part in packages for path in sorted((package / part).rglob("*")) if path.is_file()]
-    sources = [path.read_bytes() for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
+    sources = [code_of(path) for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
     folder = config.cache.mkdir(name) / hash_of(*sources)
     folder.mkdir(exist_ok=True)
     for other in folder.parent.iterdir():
@@ -227,6 +245,30 @@ def blank_pictures(monkeypatch, rough_layout):
     """Pictures are written with nothing on them: for tests of all but pictures, which take a second each."""
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda figure, *args, **options: save(Figure((1, 1)), *args, **options))
+
+
+def hash_of_figure(figure):
+    """Hash of what a figure draws: the values, texts, colours and limits of all its artists."""
+    parts = []
+    for artist in figure.findobj():
+        parts.append(type(artist).__name__.encode())
+        for name in DRAWN:
+            value = getattr(artist, name, tuple)()
+            for each in value if isinstance(value, list) else [value]:
+                each = np.asarray(getattr(each, "vertices", each))
+                parts.append(repr(each.tolist()).encode() if each.dtype == object else each.tobytes())
+    return hash_of(*parts)
+
+
+@pytest.fixture
+def hashed_pictures(monkeypatch):
+    """Pictures are written with the hash of what they show: for tests that compare two, without drawing both."""
+    save = Figure.savefig
+
+    def save_hash(figure, *args, metadata, **options):
+        save(Figure((1, 1)), *args, metadata=metadata | {"Description": hash_of_figure(figure)}, **options)
+
+    monkeypatch.setattr(Figure, "savefig", save_hash)
 
 
 @pytest.fixture

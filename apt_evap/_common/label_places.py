@@ -20,14 +20,8 @@ def place_labels(
 ) -> list[Sequence[Box] | None]:
     """First free option of each label, the most important label first; None for a label without a free one.
 
-    Parameters
-    ----------
-    options : sequence
-        Of each label its options, the best first: boxes that it covers, that of its text first.
-    area : tuple of float
-        Box of all texts.
-    taken : iterable of tuple of float
-        Boxes of what is drawn already.
+    An option is a sequence of boxes that it covers, that of its text first; texts stay in `area`, off the boxes in
+    `taken`.
     """
     arrays = [np.array(list(boxes), dtype=float) for boxes in options]  # (options, boxes, 4)
     return _placed(options, arrays, area, np.array(list(taken), dtype=float).reshape(-1, 4))
@@ -72,18 +66,8 @@ def place_above(
 ) -> list[Sequence[Box] | None]:
     """Boxes of the labels of peaks, above a curve: that of the text, and that of a line down to the peak.
 
-    Parameters
-    ----------
-    peaks : ndarray, shape (n, 2)
-        Tops of the peaks, the most important first.
-    sizes : ndarray, shape (n, 2)
-        Widths and heights of the labels.
-    area : tuple of float
-        Box of all texts.
-    highest : callable
-        The highest point of the curve from the left to the right.
-    taken : iterable of tuple of float
-        Boxes of what is drawn already.
+    `peaks` are their tops, the most important first, shape (n, 2), `sizes` widths and heights of the labels, shape (n,
+    2). `highest` returns the highest point of the curve from the left to the right.
     """
     options = [
         _above(peak, size, np.delete(peaks[:, 0], number), area, highest)

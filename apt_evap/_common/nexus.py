@@ -50,24 +50,11 @@ def put_nxapm(
     radius: float | None = None,
     shank_angle: float | None = None,
 ) -> None:
-    """Write all that NXapm requires, and the hits.
+    """Write all that NXapm requires, and the hits; arrays are of shape (n,).
 
-    Parameters
-    ----------
-    ions : array_like of int64
-        Number of each ion in the sequence of evaporation, shape (n,).
-    hits : array_like or None
-        Positions on the detector [mm], shape (n, 2).
-    times : array_like or None
-        Times of flight [ns], shape (n,). NXapm has no units for this field.
-    masses : array_like or None
-        Mass-to-charge ratios [Da], shape (n,).
-    multiplicity : array_like of uint32, optional
-        Number of ions in the pulse of each ion, shape (n,).
-    radius : float, optional
-        Initial radius of the specimen [nm].
-    shank_angle : float, optional
-        Half the opening angle of its shank [degrees].
+    Units are mm (`hits`, shape (n, 2)), ns (`times`, a field that NXapm gives no unit), Da, nm (`radius`, at the first
+    ion) and degrees (`shank_angle`, half the opening angle). `ions` are numbers in the sequence of evaporation,
+    `multiplicity` is the number of ions in the pulse of each ion.
     """
     file.attrs["NX_class"] = "NXroot"
     entry = put_group(file, ENTRY, "NXentry")

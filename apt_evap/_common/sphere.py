@@ -10,26 +10,10 @@ from apt_evap._core.sphere_sums import sphere_equations
 
 
 def fit_sphere(points: Floats, chosen: Integers | None = None) -> tuple[Floats, float]:
-    """Algebraic least-squares sphere through points.
+    """Centre and radius of the sphere through points [nm], shape (n, 3), or those with the indices `chosen`.
 
-    Parameters
-    ----------
-    points : ndarray
-        Points [nm], shape (n, 3).
-    chosen : ndarray of int, optional
-        Indices of at least four points that count, shape (m,); by default all.
-
-    Returns
-    -------
-    centre : ndarray, shape (3,)
-        Centre [nm].
-    radius : float
-        Radius [nm].
-
-    Notes
-    -----
-    The sphere minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. On a rough cap it is a
-    little too small, and single points far inside make it smaller: `analysis.fit_caps` is robust against them.
+    It minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. On a rough cap it is a little
+    too small, and single points far inside make it smaller: `analysis.fit_caps` is robust against them.
     """
     chosen = np.arange(len(points)) if chosen is None else chosen
     middle, matrix, right = sphere_equations(np.ascontiguousarray(points, np.float64), chosen)

@@ -359,42 +359,15 @@ def ion_charges(hits: Hits, element: str, ranges: Ranges | None = None) -> Integ
 
 
 def ratio_of_counts(lower: ArrayLike, upper: ArrayLike) -> tuple[Floats, Floats]:
-    """Charge state ratio from numbers of ions, with its statistical error; see `ChargeStateCounts`.
-
-    Parameters
-    ----------
-    lower, upper : array_like of int
-        Numbers of ions with the charges n and n + 1, of equal shape.
-
-    Returns
-    -------
-    ratio : ndarray
-        Charge state ratio.
-    error : ndarray
-        Standard error of its natural logarithm.
-    """
+    """Charge state ratios from numbers of ions, and standard errors of their logarithms; see `ChargeStateCounts`."""
     lower, upper = np.asarray(lower) + 0.5, np.asarray(upper) + 0.5
     return upper / lower, np.sqrt(1 / lower + 1 / upper)
 
 
 def field_of_counts(element: str, charge: int, lower: ArrayLike, upper: ArrayLike) -> tuple[Floats, Floats]:
-    """Field from numbers of ions with two charges, with its statistical error.
+    """Fields [V/nm] on the scale of Kingham's curves from numbers of ions with the charges n = `charge` and n + 1 [e].
 
-    Parameters
-    ----------
-    element : str
-        Chemical symbol, one of `RATIO_PARAMETERS`.
-    charge : int
-        Lower charge n of the two [e].
-    lower, upper : array_like of int
-        Numbers of ions with the charges n and n + 1, of equal shape.
-
-    Returns
-    -------
-    field : ndarray
-        Field on the scale of Kingham's curves [V/nm].
-    error : ndarray
-        Standard error [V/nm]: half the difference of the fields at ln(ratio) plus and minus its error.
+    Their standard errors are half the difference of the fields at ln(ratio) plus and minus its error.
     """
     if element not in RATIO_PARAMETERS:
         raise ValueError(

@@ -96,23 +96,11 @@ def _of_tip(tip):
 
 
 def describe_atoms(positions: Floats, numbers: NDArray[np.integer], names: Sequence[str]) -> dict[str, Any]:
-    """Summarise the atoms of a specimen.
+    """Summarise the atoms of a specimen, as `describe`, from positions [nm] and numbers of their species or phases.
 
-    Parameters
-    ----------
-    positions : ndarray, shape (n, 3)
-        Places of the atoms [nm].
-    numbers : ndarray of int, shape (n,)
-        Species or phase of each atom.
-    names : sequence of str
-        Names of these; the first one is the matrix.
-
-    Returns
-    -------
-    dict
-        As `describe`. ``atoms_above`` has, for each of the names but the first, the number of all atoms that are less
-        deep below the sphere of the apex, along z, than the first, a tenth and nine tenths of the atoms of this name:
-        about the ions before a particle is reached, entered and passed. Not all of them hit the detector.
+    ``atoms_above`` has, for each name but the first, that of the matrix, the number of all atoms that are less deep
+    below the sphere of the apex, along z, than the first, a tenth and nine tenths of the atoms of this name: about the
+    ions before a particle is reached, entered and passed. Not all of them hit the detector.
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
     contents = {

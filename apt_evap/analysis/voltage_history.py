@@ -30,52 +30,22 @@ class SmoothedHistory(NamedTuple):
 
 
 def evaporation_fields(run: Run) -> Floats:
-    """Evaporation field of the species of each ion.
-
-    Parameters
-    ----------
-    run : Run
-        The ions; the materials are in its settings.
-
-    Returns
-    -------
-    ndarray
-        [V/nm], shape (n,).
-    """
+    """Evaporation field of the species of each ion of a run [V/nm], shape (n,)."""
     return check_kind(run, "run", Run, "a Run").evaporation_fields
 
 
 def evaporation_voltages(run: Run) -> Floats:
-    r"""Voltage at which each ion of a run reaches its evaporation field.
+    """Voltage at which each ion of a run reaches its evaporation field, V F_evap / F [V], shape (n,).
 
-    Returns
-    -------
-    ndarray
-        [V], shape (n,).
-
-    Notes
-    -----
-    Charges and fields are proportional to the voltage. An atom that evaporates at the field F, simulated at the voltage
-    V, reaches the evaporation field of its species at
-
-    .. math:: V_\mathrm{evap} = V \, F_\mathrm{evap} / F
-
-    which is the voltage that a measurement at a constant rate would apply.
+    Charges and fields are proportional to the voltage: an atom that evaporates at the field F is simulated at the
+    voltage V. A measurement at a constant rate would apply the result.
     """
     fields = evaporation_fields(run)
     return run.voltage * fields / run.fields
 
 
 def smoothed_history(values: ArrayLike, points: int = 200) -> SmoothedHistory:
-    """Median and 5 and 95 % percentiles of successive sections of nearly equal length.
-
-    Parameters
-    ----------
-    values : array_like
-        A quantity of each ion, shape (n,), in the order of evaporation.
-    points : int
-        Number of sections k; n if there are fewer values.
-    """
+    """Median and 5 and 95 % percentiles of `points` successive sections of nearly equal length, at most one a value."""
     values = check_array(values, "values", ("n",), finite=False)
     points = check_count(points, "points", at_least=1)
     if not len(values):

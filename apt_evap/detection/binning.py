@@ -27,21 +27,12 @@ class Quantisation(NamedTuple):
 
 
 def find_quantisation(values: Floats) -> Quantisation | None:
-    """Find the quantisation of coordinates, if there is one.
+    """Find the quantisation of coordinates along one axis [mm], if there is one.
 
-    The gaps between the sorted distinct values, divided by the smallest gaps and rounded, give the integer k of each
-    value. A straight line of value against k gives spacing and origin.
-
-    Parameters
-    ----------
-    values : ndarray
-        Coordinates along one axis [mm], shape (n,); about 100,000 of them, evenly spaced, are looked at.
-
-    Returns
-    -------
-    Quantisation or None
-        None if few values repeat, if the RMS deviation from the line exceeds a tenth of the spacing, or if the spacing
-        is only the rounding of the floating point type.
+    About 100,000 coordinates, evenly spaced, are looked at. The gaps between the sorted distinct values, divided by the
+    smallest gaps and rounded, give the integer k of each value. A straight line of value against k gives spacing and
+    origin. None if few values repeat, if the RMS deviation from the line exceeds a tenth of the spacing, or if the
+    spacing is only the rounding of the floating point type.
     """
     values = values[:: max(1, len(values) // 100_000)]
     levels = np.unique(values)
@@ -108,23 +99,10 @@ def bin_edges(
     extent: tuple[float, float, float, float] | None = None,
     quantisations: tuple[Quantisation, ...] | None = None,
 ) -> tuple[Floats, Floats]:
-    """Edges of bins of equal size that cover the extent.
+    """Edges in x and y [mm] of bins of equal size, about `bins` along the longer side of the extent.
 
-    Parameters
-    ----------
-    x, y : ndarray
-        Detector coordinates [mm], shape (n,).
-    bins : int
-        Number of bins along the longer side; approximate for quantised coordinates.
-    extent : tuple of float, optional
-        x_min, x_max, y_min, y_max [mm]; that of the coordinates by default.
-    quantisations : tuple of Quantisation, optional
-        Quantisation in x and y: bins become multiples of the steps, with edges half way between the levels.
-
-    Returns
-    -------
-    x_edges, y_edges : ndarray
-        Edges [mm].
+    `extent` is x_min, x_max, y_min, y_max [mm], by default that of the coordinates. Bins of quantised coordinates are
+    multiples of the steps, with edges half way between the levels.
     """
     bins = check_count(bins, "bins", at_least=1, at_most=MAX_BINS)
     if extent is None:
@@ -182,20 +160,7 @@ def _multiples(size, quantisations):
 
 
 def count(x: Floats, y: Floats, x_edges: Floats, y_edges: Floats) -> Integers:
-    """Count hits in evenly spaced bins; hits outside are ignored, the last edges belong to the last bins.
-
-    Parameters
-    ----------
-    x, y : ndarray
-        Finite detector coordinates [mm], shape (n,).
-    x_edges, y_edges : ndarray
-        Edges [mm], shapes (nx + 1,) and (ny + 1,).
-
-    Returns
-    -------
-    ndarray
-        Hits per bin, int64 of shape (ny, nx).
-    """
+    """Hits per evenly spaced bin, int64 (ny, nx); hits outside are ignored, the last edges belong to the last bins."""
     nx, ny = len(x_edges) - 1, len(y_edges) - 1
     x_scale, y_scale = nx / (x_edges[-1] - x_edges[0]), ny / (y_edges[-1] - y_edges[0])
     total = np.zeros(nx * ny, np.int64)

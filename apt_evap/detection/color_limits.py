@@ -22,12 +22,7 @@ def color_limits(map: DetectorMap) -> tuple[float, float]:
 def common_limits(maps: Sequence[DetectorMap]) -> tuple[float, float]:
     """Common limits of a colour scale for several maps: the 0.5 and 99.5 percentiles of all densities.
 
-    The lower limit becomes 0 if it is less than 1/20 of the upper one.
-
-    Returns
-    -------
-    tuple of float
-        Lowest and highest density; 0 and 2 if all are equal.
+    The lower limit becomes 0 if it is less than 1/20 of the upper one. They are 0 and 2 if all densities are equal.
     """
     low, high = np.percentile(np.concatenate([map.density[map.mask] for map in maps]), [0.5, 99.5])
     if not high > low:

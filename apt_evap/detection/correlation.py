@@ -81,20 +81,7 @@ class Correlation:
 
 
 def correlate(mass: Floats, pulse: Integers) -> Correlation:
-    """Pairs of ions of one pulse.
-
-    Parameters
-    ----------
-    mass : ndarray
-        m/n of the ions [Da], shape (n,).
-    pulse : ndarray of int
-        Number of the pulse of each ion, shape (n,).
-
-    Raises
-    ------
-    ValueError
-        If there are too many pairs.
-    """
+    """Pairs of ions of one pulse, from m/n [Da] and number of the pulse of each ion; ValueError for too many pairs."""
     order = np.argsort(pulse, kind="stable")
     mass, pulse = np.asarray(mass, np.float64)[order], pulse[order]
     _, number = np.unique(pulse, return_counts=True)

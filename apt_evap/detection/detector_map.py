@@ -456,21 +456,9 @@ def check_sigma(sigma: object, name: str, map: DetectorMap) -> float:
 
 
 def masked_gaussian(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats:
-    """Smooth maps with a Gaussian inside a mask.
+    """Smooth maps (..., ny, nx) with a Gaussian inside a mask, standard deviations along y and x in bins; 0 outside it.
 
-    Parameters
-    ----------
-    values : ndarray
-        One map or several, shape (..., ny, nx).
-    mask : ndarray
-        Whether a bin is inside, bool of shape (ny, nx).
-    sigmas : array_like
-        Standard deviations along y and x [bins], shape (2,).
-
-    Returns
-    -------
-    ndarray
-        The smoothed values divided by the smoothed mask, 0 outside the mask, with the shape of `values`.
+    The result is the smoothed values divided by the smoothed mask.
     """
     smooth = gaussian(np.where(mask, values, 0).astype(float), sigmas)
     return np.divide(smooth, gaussian(mask.astype(float), sigmas), out=np.zeros_like(smooth), where=mask)

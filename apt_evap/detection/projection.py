@@ -40,19 +40,10 @@ def stereographic(directions: Floats) -> Floats:
 
 
 def stereographic_stretch(s2: Floats, compression: float | None) -> Floats:
-    """Ratio r / (D |s|) of the distance from the centre to the scale and the length of the stereographic direction.
+    """Ratio r / (D |s|) of distance from the centre over scale D and length of the stereographic direction.
 
-    Parameters
-    ----------
-    s2 : ndarray
-        Squared lengths of stereographic directions, tan(theta / 2)^2 < 1, shape (n,).
-    compression : float or None
-        As for `Projection`.
-
-    Returns
-    -------
-    ndarray
-        Shape (n,); 2 on the axis, where tan(theta / 2) = theta / 2.
+    `s2` are squared lengths, tan(theta / 2)^2 < 1, shape (n,); the ratio is 2 on the axis, where tan(theta / 2) = theta
+    / 2.
     """
     if compression == 1.0:
         return 2.0 / (1.0 - s2)  # tan(theta) / tan(theta / 2)

@@ -34,22 +34,12 @@ _MOST_STEPS = 64  # strays at 1e30 mm hide those at 1e10 mm: each step finds tho
 
 
 def find_strays(x: Floats, y: Floats) -> Booleans | None:
-    """Find ions far outside the field of view.
+    """Which ions are far outside the field of view, by finite detector coordinates [mm], bool (n,); None if none is.
 
     Ions are counted in bins that cover all of them. Bins where the density, averaged over a gap, is less than a
     thousandth of its median are empty. Parts that a gap of a sixth of the size separates are strays if they have few
     different places, or lie on one point or on a line along x or y. Ions within a gap of the others stay, such as those
     of a sparse rim. The rest is searched again, until nothing changes.
-
-    Parameters
-    ----------
-    x, y : ndarray
-        Finite detector coordinates [mm], shape (n,).
-
-    Returns
-    -------
-    ndarray of bool, shape (n,), or None
-        Whether each ion is a stray; None if there are none.
     """
     rows = None
     inner_x, inner_y = x, y
@@ -175,24 +165,7 @@ _FOUND: dict[int, tuple] = {}
 
 
 def strays_of(x: Floats, y: Floats, source: str) -> Booleans | None:
-    """Strays among measured ions, as `find_strays`; NaN is none. They are found, and warned of, once for two columns.
-
-    Parameters
-    ----------
-    x, y : ndarray
-        Detector coordinates [mm], shape (n,), which may be NaN.
-    source : str
-        Origin of the ions, for the warning.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,), or None
-
-    Warns
-    -----
-    DataWarning
-        If there are strays: their number and places.
-    """
+    """Strays among measured ions, as `find_strays`; NaN is none. They are found, and reported, once for two columns."""
     known = _FOUND.get(id(x))
     if known is not None and known[0]() is x and known[1]() is y:
         return known[2]

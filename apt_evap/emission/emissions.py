@@ -167,15 +167,7 @@ class TangentialLaunches(NamedTuple):
 
 
 def choose_launches(launches: Sequence[TangentialLaunches], chosen: Integers) -> TangentialLaunches:
-    """Launches of n ions, each from one of several.
-
-    Parameters
-    ----------
-    launches : sequence of TangentialLaunches
-        Each of all n ions.
-    chosen : ndarray of int, shape (n,)
-        Which one of them each ion has.
-    """
+    """Launches of n ions: of each ion that of one of several, with the number `chosen`, shape (n,)."""
     n = len(chosen)
     defaults = {"shares": np.tile([1.0, 0.0, 0.0], (n, 1)), "heights": np.zeros(n)}
     columns = {}

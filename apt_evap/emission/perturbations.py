@@ -446,14 +446,7 @@ def perturbation_of(perturbation: Any) -> Any:
 def warn_if_not_for(rule: str | None, perturbation: Any, elements: Sequence[str] = ()) -> None:
     """Warn if a perturbation, or one of a mixture, has a `Migration`: not for Robin's charges, nor for alloys.
 
-    Parameters
-    ----------
-    rule : str or None
-        Name of the charging rule, if it is known.
-    perturbation : perturbation or Extremal
-        A `Migration` is its `probability` or its `hop`.
-    elements : sequence of str
-        Names of the elements that evaporate.
+    `rule` is the name of the charging rule, None if it is not known; `elements` are those that evaporate.
     """
     if rule != "Robin" and len(elements) < 2:
         return

@@ -166,26 +166,11 @@ def field_of_ratio(element: str, charge: int, ratio: ArrayLike) -> Floats:
 
 
 def charge_probabilities(element: str, field: ArrayLike, least: int = 1) -> Floats:
-    """Probabilities of the charges of an ion after post-ionisation.
+    """Probabilities of the charges of an ion after post-ionisation, shape (n, k), each row with the sum 1.
 
-    Parameters
-    ----------
-    element : str
-        Chemical symbol, one of `RATIO_PARAMETERS`.
-    field : array_like
-        Field [V/nm] on the scale of Kingham's curves, shape (n,).
-    least : int
-        Charge with which the atom leaves [e]: the ion has this one or a higher one.
-
-    Returns
-    -------
-    ndarray
-        Probabilities of the charges `least`, `least` + 1, ... up to the highest of the fit, shape (n, k). Each row has
-        the sum 1.
-
-    Notes
-    -----
-    p(n) is proportional to the product of the ratios CSR(m) of the charges m from `least` to n - 1.
+    The charges are `least` [e], `least` + 1, ... up to the highest of the fit. An atom of an element of
+    `RATIO_PARAMETERS` leaves with the charge `least`, at a field (n,) [V/nm] on the scale of Kingham's curves. p(n) is
+    proportional to the product of the ratios CSR(m) of the charges m from `least` to n - 1.
     """
     reached, stay = _chain(element, check_array(field, "field", ("n",)), least)
     return reached * stay

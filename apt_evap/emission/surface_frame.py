@@ -130,21 +130,10 @@ def _place(emissions, shares):
 
 
 def rolled_positions(emissions: Emissions, shares: Floats | None = None) -> Floats:
-    """Positions p_r = s + d n, one nearest neighbour distance d above the place s that each ion rolls onto.
+    """Positions p_r = s + d n [nm], one nearest neighbour distance d above the place s that each ion rolls onto.
 
-    Between two phases, d is the mean of their distances.
-
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n.
-    shares : ndarray, shape (n, 3), optional
-        Shares of the targets; by default s is the strongest neighbour.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Positions [nm]; NaN for an ion without a neighbour.
+    Between two phases, d is the mean of their distances. By default s is the strongest neighbour; with `shares`, (n,
+    3), a weighted mean of targets. NaN for an ion without a neighbour.
     """
     return _place(emissions, shares) + _lift(emissions)
 
@@ -206,37 +195,15 @@ def _mean_targets(emissions, shares):
 
 
 def shared_positions(emissions: Emissions, shares: Floats) -> Floats:
-    """Positions one nearest neighbour distance above weighted means of the targets.
+    """Positions one nearest neighbour distance above weighted means of the targets [nm], shape (n, m, 3).
 
-    Parameters
-    ----------
-    emissions : Emissions
-        A batch of n, with its targets.
-    shares : ndarray, shape (n or 1, m, 3)
-        Shares of the targets.
-
-    Returns
-    -------
-    ndarray, shape (n, m, 3)
-        Positions [nm]; NaN for an ion without a neighbour.
+    `shares` of the targets have the shape (n or 1, m, 3). NaN for an ion without a neighbour.
     """
     return _mean_targets(emissions, shares) + _lift(emissions)[:, None]
 
 
 def along_surface(normals: ArrayLike, first: Floats, second: Floats) -> Floats:
-    """Vectors along the surface from their components in the tangent frame.
-
-    Parameters
-    ----------
-    normals : array_like, shape (n, 3)
-        Outward unit normals.
-    first, second : ndarray, shape (n,) or (n, m)
-        Components along t1 and t2 of `tangent_frame`, of one or of m vectors at each normal.
-
-    Returns
-    -------
-    ndarray, shape (n, 3) or (n, m, 3)
-    """
+    """Vectors (n, 3) or (n, m, 3) along the surface from their components along t1 and t2 of `tangent_frame`."""
     frame = tangent_frame(normals)
     if np.ndim(first) == 2:
         frame = frame[0][:, None], frame[1][:, None]

@@ -297,16 +297,9 @@ class BondCodes(NamedTuple):
 
 
 def bond_table(bonds: Any, tip: Tip) -> tuple[BondCodes, Floats, Integers]:
-    """Codes of the bonds of a specimen, and the factor of 1/field for every code.
+    """Codes of the bonds of a specimen, the factor of 1/field for every code, and the species of each atom.
 
-    Returns
-    -------
-    codes : BondCodes
-        What each atom adds to the codes of its neighbours.
-    table : ndarray, shape (n_species, 16^counts)
-        Evaporation field of the species divided by that with these bonds.
-    species : ndarray of int32, shape (n_atoms,)
-        Species of each atom.
+    The factor, shape (n_species, 16^counts), is the evaporation field of the species divided by that with these bonds.
     """
     n_kinds = len(tip.elements) if bonds.by_species else 1
     n_counts = n_kinds * (2 if bonds.second_shell else 1)

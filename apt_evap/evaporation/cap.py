@@ -46,27 +46,12 @@ NO_CAP = Cap(math.nan, math.nan, math.nan, math.nan)
 
 
 def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_fields: Floats) -> Cap:
-    """Fit a sphere to the surface around the axis, and average the fields of its atoms.
+    """Fit a sphere to the surface atoms around the axis +z [nm], and average fields [V/nm]; NaN for less than 12 atoms.
 
-    Parameters
-    ----------
-    positions, normals : ndarray, shape (n, 3)
-        Surface atoms [nm] and their outward unit normals; the axis is +z.
-    fields, evaporation_fields : ndarray, shape (n,)
-        Field just outside each atom, and evaporation field of its species [V/nm].
-
-    Returns
-    -------
-    Cap
-        NaN if fewer than 12 atoms are around the axis.
-
-    Notes
-    -----
     The mean with the charges as weights is V/R for a sphere: the field F is twice that of the other charges, and the
     sum of q r.E over all charges is their energy Q V/2 (virial theorem). Measured on spheres of fcc atoms: 2.2, 1.0 and
-    0.5 % less at R = 12, 24 and 40 a. A mean without weights is 13 % less: it counts atoms below steps fully.
-
-    The fit of the sphere (`fit_sphere`) begins with atoms whose normals are within 45 degrees of the axis.
+    0.5 % less at R = 12, 24 and 40 a. A mean without weights is 13 % less: it counts atoms below steps fully. The fit
+    of the sphere (`fit_sphere`) begins with atoms whose normals are within 45 degrees of the axis.
     """
     cosine = float(sine_and_cosine(math.radians(HALF_ANGLE))[1])
     chosen = np.flatnonzero(normals[:, 2] >= cosine)
@@ -85,15 +70,7 @@ def measure_cap(positions: Floats, normals: Floats, fields: Floats, evaporation_
 
 
 def doubt_of_cap(radius: float, apex_radius: float | None) -> str:
-    """What is wrong with the cap of a tip before its first event, "" if nothing is.
-
-    Parameters
-    ----------
-    radius : float
-        That of the cap [nm]; NaN if there is none.
-    apex_radius : float or None
-        That of the tip [nm], if it is known.
-    """
+    """What is wrong with the cap of a tip before its first event, from the radii of both [nm], "" if nothing is."""
     if math.isnan(radius):
         return (
             f'field_reference = "cap" needs at least {FEWEST} evaporable atoms within {HALF_ANGLE:g} degrees of the '

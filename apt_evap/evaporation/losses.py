@@ -138,17 +138,7 @@ def conditions(
 
 
 def between_pulses(sensitivity: float, law: Arrhenius, control: VoltageControl) -> tuple[float, float]:
-    """Ions at the standing voltage for each ion in a pulse, and the field x of the working point.
-
-    Parameters
-    ----------
-    sensitivity : float
-        C [eV].
-    law : Arrhenius
-        Temperature, attempt frequency and barrier.
-    control : VoltageControl
-        Rate and pulses.
-    """
+    """Ions at the standing voltage for each ion in a pulse, and the field x of the working point; C is in eV."""
     reach, _ = law.working_point(sensitivity, control)
     stiffness = sensitivity / (BOLTZMANN * law.temperature)
     x = _field_of(law.barrier, stiffness, reach)

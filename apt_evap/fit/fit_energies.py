@@ -336,17 +336,9 @@ def _contrasts(structure):
 
 
 def real_units_of(run: Run) -> dict[str, Any] | None:
-    """Operating point of a run, and the factors from the energies of a study to real and simulated ones.
+    """Operating point of a run, and factors from the energies of a study to real and simulated ones.
 
-    Parameters
-    ----------
-    run : Run
-        At its simulated voltage or in real units.
-
-    Returns
-    -------
-    dict or None
-        None if the fields of the cap, which real units need, are not in the run.
+    None if the fields of the cap, which real units need, are not in the run.
     """
     try:
         real = run.in_real_units()

@@ -228,19 +228,9 @@ def maxima(values: Floats) -> Integers:
 
 
 def spline_maxima(places: list[Floats], values: Floats) -> Floats:
-    """Maxima of cubic splines through the points of `EnergyGrid.around`, to 1/20 of a step.
+    """Positions of the maxima of cubic splines through the points of `EnergyGrid.around`, to 1/20 of a step, (k, axes).
 
-    Parameters
-    ----------
-    places : list of ndarray
-        Positions on the axes, five or one.
-    values : ndarray
-        Values at these positions, shape (k, a, b, ...).
-
-    Returns
-    -------
-    ndarray
-        Positions of the k maxima, shape (k, number of axes).
+    `places` are positions on the axes, five or one, `values` those of the k splines at these, shape (k, a, b, ...).
     """
     spline, fine = scipy.interpolate.make_interp_spline(_HALVES, np.eye(5))(_FINE), []
     for axis, along in enumerate(places):

@@ -31,17 +31,7 @@ _REACH = math.radians(15.0)  # angle from the axis of the run within which both 
 def registration_start(centre: Sequence[float], scale: float) -> dict[str, Any]:
     """Start and bounds of the registration of a run with the settings of a `StartSettings`, for `register`.
 
-    Parameters
-    ----------
-    centre : sequence of float
-        Place of the axis on the map [mm].
-    scale : float
-        Of the indexed map [mm/rad].
-
-    Returns
-    -------
-    dict
-        start, rotations [degrees], scales, tolerance [mm].
+    `centre` is the place of the axis on the map [mm], `scale` that of the indexed map [mm/rad].
     """
     x, y = centre
     return _bounded(Registration(0.0, 1.0, (x, y)), scale)
@@ -53,24 +43,10 @@ def index_as_run(
     distance: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Indexing | None:
-    """Index a map for the crystal of a run.
+    """Index a map for the crystal of a run; the flight length of the instrument [mm] bounds the scale.
 
-    Parameters
-    ----------
-    measured : DetectorMap
-        The measured map.
-    crystal : Orientation or None
-        Crystal of the run.
-    distance : float, optional
-        Flight length of the instrument [mm], which bounds the scale.
-    progress : callable, optional
-        As for `index`.
-
-    Returns
-    -------
-    Indexing or None
-        None if there is no crystal, there are no patterns of its structure, or the map cannot decide: it has fewer than
-        4,000 ions, too few bins, or no scale for this flight length.
+    None if there is no crystal, there are no patterns of its structure, or the map cannot decide: it has fewer than
+    4,000 ions, too few bins, or no scale for this flight length.
     """
     if crystal is None or (measured.is_counts and (measured.ions or 0) < LEAST_IONS):
         return None
@@ -83,21 +59,10 @@ def index_as_run(
 def indexed_start(run: Run, indexing: Indexing) -> dict[str, Any]:
     """Start and bounds of the registration of any run of a crystal on an indexed map, for `register`.
 
-    The crystal of the run is turned into the crystal of the map by the operation of its point group that brings the
-    axis of the run nearest to the centre of the map. The similarity transform follows from the places of directions
-    about this axis in both projections. If the operation is improper, the registration is mirrored.
-
-    Parameters
-    ----------
-    run : Run
-        The run.
-    indexing : Indexing
-        Of the map, for a material with the structure of the run; its first candidate counts.
-
-    Returns
-    -------
-    dict
-        As for `registration_start`.
+    The crystal of the run is turned into the crystal of the map, of the same structure, by the operation of its point
+    group that brings the axis of the run nearest to the centre of the map. The similarity transform follows from the
+    places of directions about this axis in both projections. If the operation is improper, the registration is
+    mirrored.
     """
     crystal, best = Orientation.known(run.settings["tip"]), indexing.best
     if crystal is None:
@@ -137,29 +102,15 @@ def _bounded(start, scale):
 def emission_of_pattern(rolled: float, height: float = HEIGHT) -> Perturbation:
     """The emission of the master patterns, for the registration of a run on an indexed map.
 
-    Parameters
-    ----------
-    rolled : float
-        Fraction of the ions that roll up, of a `Candidate`; below 0.1 all leave with lateral velocities.
-    height : float
-        Largest height of the start that the run permits [nm].
+    Below 0.1 of rolled ions all leave with lateral velocities; `height` is the largest of the start that the run
+    permits [nm].
     """
     height = min(height, HEIGHT)
     return RollUp(ENERGY, rolled, SHARPNESS, height) if rolled >= ROLLS else LateralVelocity(ENERGY, height)
 
 
 def register_near(hits: Hits, measured: DetectorMap, bounds: dict[str, Any]) -> Registration:
-    """Registration within bounds; its scale is that of the indexing if the maps do not determine one within them.
-
-    Parameters
-    ----------
-    hits : Hits
-        Simulated ions.
-    measured : DetectorMap
-        The measured map.
-    bounds : dict
-        Result of `registration_start` or `indexed_start`.
-    """
+    """Registration within bounds; its scale is that of the indexing if the maps do not determine one within them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", RegistrationWarning)
         registration = register(hits, measured, **bounds)

@@ -15,17 +15,9 @@ _NAMES = {"x": "detector_x", "y": "detector_y"}
 
 
 def points_and_data(path: AnyPath, hits: Hits) -> tuple[Booleans | slice, Floats, dict[str, NDArray[Any]]]:
-    """Positions and other columns of the ions to write.
+    """Selection of the ions to write, their positions (n, 3) [nm], and other columns of numbers or texts, by name.
 
-    Returns
-    -------
-    chosen : ndarray or slice
-        Selection of the ions to write.
-    positions : ndarray, shape (n, 3)
-        Positions [nm].
-    data : dict of ndarray
-        Other columns by name, with the columns of `extra` that are numbers or texts. Detector coordinates are called
-        detector_x and detector_y.
+    Detector coordinates are called detector_x and detector_y.
     """
     (positions,) = hits.require("positions")
     finite = np.isfinite(positions).all(axis=1)

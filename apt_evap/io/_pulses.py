@@ -200,12 +200,7 @@ def first_from_every(multiplicity: NDArray[np.integer], *, cut: bool = False) ->
 def ions_per_pulse(numbers: NDArray[Any]) -> tuple[NDArray[np.uint32] | None, str]:
     """Ions per pulse for the first ion of each pulse and 0 for the others, from numbers for the first or for all ions.
 
-    Returns
-    -------
-    ions : ndarray of uint32 or None
-        None if the numbers are inconsistent.
-    problem : str
-        What is inconsistent.
+    None if the numbers are inconsistent; the second result says why.
     """
     if numbers.dtype.kind not in "iu":
         return None, f"it has values of type {numbers.dtype}"

@@ -113,30 +113,11 @@ def open_words(
     byte_order: str | None = None,
     rival: tuple[str, int] | None = None,
 ) -> Iterator[Words]:
-    """Open a headerless file and check its size and byte order.
+    """Open a headerless file of `row_size` bytes per ion, and check its size and byte order.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    row_size : int
-        Bytes per ion.
-    kind : str
-        Name of the format, for messages.
-    order : {"big", "little"}
-        Byte order of the format.
-    floats : int
-        Number of words at the start of a row that are float32. The byte order is checked by their values.
-    partial : bool
-        Read the complete ions of a file that ends in the middle of an ion.
-    byte_order : {None, "big", "little"}
-        None reads in the byte order of the format and checks it.
-    rival : (str, int), optional
-        Name and row size of another format that the file may have.
-
-    Yields
-    ------
-    Words
+    The byte order is that of the format, checked by the values of the first `floats` words of a row, which are float32;
+    `byte_order` replaces it. With `partial`, the complete ions of a file that ends in the middle of an ion are read.
+    `rival` is name and row size of another format that the file may have.
     """
     check_switch(partial, "partial")
     if byte_order is not None:
@@ -172,21 +153,7 @@ def fill(file: Any, array: Any) -> int:
 
 
 def check_columns(columns: str | Sequence[str] | None, available: Sequence[str], path: AnyPath) -> tuple[str, ...]:
-    """Return the names of the columns to read.
-
-    Parameters
-    ----------
-    columns : str or sequence of str, optional
-        Requested columns; None for all.
-    available : sequence of str
-        Columns of the file.
-    path : str or path-like
-        For the message.
-
-    Returns
-    -------
-    tuple of str
-    """
+    """Names of the columns to read, of those that the file has; all by default."""
     if columns is None:
         return tuple(available)
     try:
@@ -202,21 +169,9 @@ def check_columns(columns: str | Sequence[str] | None, available: Sequence[str],
 def choose_fields(
     columns: Any, available: Sequence[str], fields: dict[str, Any], path: AnyPath, also: dict[str, Any]
 ) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """Return the names of the columns to read, and the required fields.
+    """Names of the columns to read, and the fields that these need.
 
-    Parameters
-    ----------
-    columns, available, path
-        As for `check_columns`.
-    fields : dict
-        All fields of the format by name, as for `Words.read`.
-    also : dict
-        Names of further fields needed for a column, by its name.
-
-    Returns
-    -------
-    chosen : tuple of str
-    fields : dict
+    `fields` are all of the format, as for `Words.read`; `also` has names of further fields that a column needs.
     """
     chosen = check_columns(columns, available, path)
     needed = {*chosen, *(other for name in chosen for other in also.get(name, ()))}
@@ -241,27 +196,7 @@ def check_any(chosen: Any, path: AnyPath) -> None:
 
 
 def choose(path: AnyPath, hits: Hits, columns: Any) -> Any:
-    """Select the ions to write: those that hit the detector and have finite values; warn with the number of others.
-
-    Parameters
-    ----------
-    path : str or path-like
-        For the message.
-    hits : Hits
-        All ions.
-    columns : sequence of (int, ndarray or None, str)
-        As for `write_words`.
-
-    Returns
-    -------
-    ndarray or slice
-        Selection of the ions to write.
-
-    Raises
-    ------
-    ValueError
-        If there is no ion to write.
-    """
+    """Select the ions to write: those that hit the detector and have finite values; warn with the number of others."""
     hit = np.ones(len(hits), bool) if hits.outcome is None else hits.outcome == Outcome.HIT
     finite = finite_rows(columns, len(hits))
     omitted = int(np.count_nonzero(~hit)), int(np.count_nonzero(hit & ~finite))
@@ -294,18 +229,10 @@ def tell_omitted(path: AnyPath, n: int, n_missed: int, n_not_finite: int) -> Non
 
 
 def write_words(path: AnyPath, columns: Any, row_size: int, chosen: Any) -> None:
-    """Write columns side by side as big-endian 4-byte words, chunk by chunk.
+    """Write columns side by side as big-endian 4-byte words, `row_size` bytes per ion, chunk by chunk.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file; an existing one is replaced when the new one is complete.
-    columns : sequence of (int, ndarray or None, str)
-        First word, values of shape (n,) or (n, words) and type ("f4" or "u4"); None is written as zeros.
-    row_size : int
-        Bytes per ion.
-    chosen : ndarray or slice
-        Selection of the ions to write.
+    A column is its first word, values of shape (n,) or (n, words), None for zeros, and a type ("f4" or "u4"). An
+    existing file is replaced when the new one is complete.
     """
     with replace_file(path) as file:
         put_words(file, columns, row_size, chosen)

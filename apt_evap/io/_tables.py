@@ -61,26 +61,7 @@ class Table:
 
 
 def read_table(path: AnyPath, what: str, at_most: int) -> Table:
-    """Read a text table.
-
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    what : str
-        Expected content, for messages.
-    at_most : int
-        Largest allowed size [bytes].
-
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, has no row of numbers, or a line has more or fewer cells than the others.
-    """
+    """Read a text table of up to `at_most` bytes; `what` is the expected content, for messages."""
     text = read_text(path, what, at_most)
     if "\0" in text:
         raise FileError(f"{str(path)!r} is not a text: it has zero bytes, expected {what}")

@@ -35,14 +35,7 @@ _NAMED = {symbol: number for number, symbol in enumerate(SYMBOLS, 1)} | {"D": 1}
 def read_bytes(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> bytes:
     """Read a complete file, decompressed if it is compressed by gzip, bzip2 or xz, and texts of UTF-16 in UTF-8.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file.
-    what : str
-        Expected content, for messages.
-    at_most : int
-        Largest allowed size [bytes], also after decompression.
+    `what` is the expected content, for messages, `at_most` the largest allowed size [bytes], also after decompression.
     """
     data = read_small_file(path, at_most, what)
     if not data:
@@ -149,26 +142,8 @@ def read_text(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> str:
 def read_numbers(path: AnyPath, what: str, names: Sequence[str], at_most: int = _MAX_BYTES) -> dict[str, Floats]:
     """Read a text table of numbers, one row per line, separated by spaces, tabulators, semicolons or commas.
 
-    Parameters
-    ----------
-    path : str or path-like
-        The file. Empty lines and lines that begin with # are left out.
-    what : str
-        Expected content, for messages.
-    names : sequence of str
-        Names of the columns; a line with fewer or more numbers is an error.
-    at_most : int
-        Largest allowed size [bytes].
-
-    Returns
-    -------
-    dict of ndarray
-        Columns by name, float64 (n,).
-
-    Raises
-    ------
-    FileError
-        If the file cannot be read, has no row, or a line does not contain these numbers.
+    Returns float64 columns by name. Empty lines and lines that begin with # are left out; a line with fewer or more
+    numbers than names is an error.
     """
     rows = []
     for at, line in enumerate(read_text(path, what, at_most).splitlines(), 1):
@@ -314,23 +289,9 @@ def isotope_masses(name: str) -> list[float]:
 def composition_of(species: Mapping[str, int], low: float, high: float) -> tuple[dict[str, int], str]:
     """Number of atoms of each element in the ion of a range, whose species may be molecules or isotopes; its formula.
 
-    "Ti46" is one atom and "C60" sixty: the number after an element is that of an isotope or of atoms, whichever gives
-    a mass within the range for a charge from 1 to 4. If both or neither do, it is that of a natural isotope, but that
-    of atoms after hydrogen.
-
-    Parameters
-    ----------
-    species : mapping of str to int
-        Number of each species in the ion.
-    low, high : float
-        Bounds of the range [Da].
-
-    Returns
-    -------
-    atoms : dict of str to int
-        Names that are not formulas stay.
-    formula : str
-        With the isotopes, such as "Ni58O".
+    "Ti46" is one atom and "C60" sixty: the number after an element is that of an isotope or of atoms, whichever gives a
+    mass within the range [Da] for a charge from 1 to 4. If both or neither do, it is that of a natural isotope, but
+    that of atoms after hydrogen. Names that are not formulas stay.
     """
     parts = []  # of all species: element, digits, number of the species
     certain = set()  # parts that are isotopes, such as "28Si"

@@ -203,17 +203,7 @@ def symmetric_cells(
 ) -> Integers:
     """Number of the cell about a pole to which every bin of a map belongs; symmetric places have the same cell.
 
-    Parameters
-    ----------
-    map, projection, pole, symmetry, toward, reach
-        As for `folded`.
-    size : float
-        Edge of a cell [degrees].
-
-    Returns
-    -------
-    ndarray of int
-        Shape of the map; -1 outside its mask and the reach.
+    Arguments as for `folded`, `size` is the edge of a cell [degrees]; -1 outside the mask and the reach.
     """
     frame = pole_frame(map, projection, pole, np.inf)
     order = int(symmetry[0]) if symmetry[0].isdigit() else 1

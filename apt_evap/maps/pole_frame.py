@@ -55,19 +55,7 @@ def axes_about(pole: Floats) -> Floats:
 
 
 def pole_frame(map: DetectorMap, projection: Directions, pole: ArrayLike, ions: float | None) -> PoleFrame:
-    """Bins of a map in the frame of a pole.
-
-    Parameters
-    ----------
-    map : DetectorMap
-        Counts or densities.
-    projection : Projection
-        From directions in the crystal onto the detector.
-    pole : array_like
-        Direction of the pole in the frame of the projection, shape (3,).
-    ions : float or None
-        As for `hits_per_bin`.
-    """
+    """Bins of a map of counts or densities in the frame of a pole, a direction in the frame of the projection."""
     check_kind(map, "map", DetectorMap, "a DetectorMap")
     check_kind(projection, "projection", "directions", "a Projection")
     pole = unit_vector(pole)

@@ -79,19 +79,7 @@ def local_similarity(first: Moments, second: Moments, data_range: float, noise: 
 def similarity_gradients(
     first: Moments, second: Moments, data_range: float, noise: float | Floats, weights: Floats
 ) -> tuple[Floats, Floats]:
-    """Derivatives of a weighted sum of `local_similarity` with respect to the densities of either map.
-
-    Parameters
-    ----------
-    first, second, data_range, noise
-        As for `local_similarity`, of two maps.
-    weights : ndarray, shape (ny, nx)
-        Weights of the bins.
-
-    Returns
-    -------
-    tuple of two ndarray, shape (ny, nx)
-    """
+    """Derivatives (ny, nx) of a weighted sum of `local_similarity` with respect to the densities of either map."""
     c1, c2 = (0.01 * data_range) ** 2, (0.03 * data_range) ** 2
     product = first.mean * second.mean
     covariance = window_mean(first.density * second.density) - product

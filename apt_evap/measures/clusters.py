@@ -185,24 +185,12 @@ def _grown(places, of_solutes, envelope, erosion):
 def held_out_atoms(
     positions: Floats, solute: Booleans, of_solutes: Integers, atoms: Floats, options: ClusterSettings
 ) -> Floats:
-    """Mean number of atoms of each element in each cluster, where solutes do not count that made the cluster.
+    """Mean number of atoms of each element in each cluster, where solutes do not count that made the cluster, (k, e).
 
     Envelope and erosion of a random half of the solutes of the clusters are the region in which the other half counts
     twice: whether an ion in it is a solute of that half or a solvent did not enter into the choice of the region. The
-    distances are those of half the solutes, larger by the cube root of 2.
-
-    Parameters
-    ----------
-    positions, solute, options
-        As for `label_clusters`.
-    of_solutes : ndarray of int, shape (n,)
-        Number of the cluster of each solute, -1 outside.
-    atoms : ndarray, shape (n, e)
-        Atoms of each element in each ion.
-
-    Returns
-    -------
-    ndarray, shape (k, e)
+    distances are those of half the solutes, larger by the cube root of 2. `of_solutes` is the number of the cluster of
+    each solute, -1 outside, `atoms` has those of each element in each ion, shape (n, e).
     """
     k = int(of_solutes.max(initial=-1)) + 1
     if not k:

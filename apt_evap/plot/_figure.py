@@ -82,17 +82,7 @@ _LOG_STEPS = ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 7))  # ticks per decade: the
 def add_colorbar(
     images: Sequence[AxesImage], ax: Axes | Sequence[Axes], label: str = "hits per area / mean"
 ) -> Colorbar:
-    """Add a colour bar for images with a common scale; arrows mark ends with values beyond the scale.
-
-    Parameters
-    ----------
-    images : sequence of matplotlib.image.AxesImage
-        Images with the colours.
-    ax : matplotlib.axes.Axes or list of them
-        Axes that give space to the bar.
-    label : str
-        Quantity of the colours, with its unit.
-    """
+    """Add a colour bar for images with a common scale; arrows mark ends with values beyond the scale."""
     low, high = images[0].get_clim()
     below = min(np.nanmin(image.get_array()) for image in images) < low
     above = max(np.nanmax(image.get_array()) for image in images) > high

@@ -67,17 +67,7 @@ def label_peaks(
     heights: Floats,
     **style: Any,
 ) -> None:
-    """Write labels above the peaks of a histogram, the first ones first, as many as have a place.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        Axes of the histogram.
-    labels : sequence of tuple
-        Text, top of the peak, and colour.
-    edges, heights : ndarray
-        The histogram.
-    """
+    """Write labels (text, top, colour) above the peaks of a histogram, the first ones first, as many as fit."""
     texts = [
         ax.annotate(text, peak, xytext=(0, 0), textcoords="offset pixels", ha="left", va="bottom", color=color, **style)
         for text, peak, color in labels

@@ -246,17 +246,7 @@ def _circle(map):
 
 
 def describe(map: DetectorMap) -> str:
-    """Caption of a map: its number of ions, the size of its bins and its smoothing.
-
-    Parameters
-    ----------
-    map : DetectorMap
-        The map.
-
-    Returns
-    -------
-    str
-    """
+    """Caption of a map: its number of ions, the size of its bins and its smoothing."""
     width, height = map.bin_size
     square = abs(width / height - 1) < 1e-3
     size = f"{width:.3g} mm bins" if square else f"{width:.3g} × {height:.3g} mm bins"

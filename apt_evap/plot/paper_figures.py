@@ -88,18 +88,7 @@ def paper_maps(
 
 @with_default_settings
 def add_scale_bar(ax: Axes) -> float:
-    """Draw a scale bar in the lower left corner of a map.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        A map in mm.
-
-    Returns
-    -------
-    float
-        Its length, 1, 2 or 5 times a power of ten [mm].
-    """
+    """Draw a scale bar in the lower left corner of a map [mm]; return its length, 1, 2 or 5 times a power of ten."""
     low, high = ax.get_xlim()
     longest = _BAR * abs(high - low)
     power = 10.0 ** floor(log10(longest))

@@ -22,16 +22,8 @@ def phase_outlines(
 ) -> None:
     """Draw the outline of 90 % of the ions of each phase over maps, with a label for a legend.
 
-    A phase whose ions are all over the map, such as layers along the axis, is left out.
-
-    Parameters
-    ----------
-    axes : sequence of matplotlib.axes.Axes
-        Axes of the maps.
-    maps : sequence of DetectorMap
-        The maps.
-    phases : sequence of mapping
-        For each map the maps of the ions of phases, by their names, with the same bins.
+    `phases` has for each map the maps of the ions of phases, by their names, with the same bins. A phase whose ions are
+    all over the map, such as layers along the axis, is left out.
     """
     names = list(dict.fromkeys(name for parts in phases for name in parts))
     for ax, whole, parts in zip(axes, maps, phases, strict=True):

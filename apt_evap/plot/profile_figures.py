@@ -131,23 +131,7 @@ def profile_comparison(
 def rectangles(
     chosen: Rectangle | Sequence[Rectangle], ax: Axes, *, colors: Any = "cyan", labels: Sequence[str] | None = None
 ) -> DrawnAxes:
-    """Draw rectangles on a detector map, with a thin line at the zero of the profile.
-
-    Parameters
-    ----------
-    chosen : Rectangle or sequence of Rectangle
-        The rectangles.
-    ax : matplotlib.axes.Axes
-        Axes of the map.
-    colors : color or sequence of them
-        Colours of the rectangles.
-    labels : sequence of str, optional
-        One label each.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-    """
+    """Draw one or several rectangles on a detector map, with a thin line at the zero of the profile."""
     chosen = [chosen] if isinstance(chosen, Rectangle) else list(chosen)
     colors = [colors] * len(chosen) if isinstance(colors, str) else list(colors)
     for index, (rectangle, color) in enumerate(zip(chosen, colors, strict=True)):

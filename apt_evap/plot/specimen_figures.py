@@ -248,19 +248,7 @@ def mark_atoms(
     elevation: float = 90.0,
     azimuth: float = -90.0,
 ) -> DrawnAxes:
-    """Draw dashed circles around atoms in a plot of the specimen.
-
-    Parameters
-    ----------
-    positions : array_like
-        The atoms [nm], shape (n, 3), such as ``run.emissions.positions[ions]``.
-    ax : matplotlib.axes.Axes
-        Axes of the plot.
-    colors : color or sequence of them
-        Colours of the circles.
-    elevation, azimuth : float
-        As for the plot [degrees].
-    """
+    """Draw dashed circles around atoms [nm], shape (n, 3), in a plot of the specimen with these angles [degrees]."""
     positions = check_array(positions, "positions", ("n", 3))
     right, up, _ = _viewed_from(elevation, azimuth)
     ax.scatter(

@@ -45,24 +45,12 @@ class CapDensity:
 
 
 def density_of(places: Floats, rim: float, widening: float, bins: int) -> CapDensity:
-    r"""Density of ions on the cap.
+    r"""Density of ions on the cap, from their places x / R and y / R, shape (n, 2).
 
-    Parameters
-    ----------
-    places : ndarray
-        x / R and y / R of each ion, shape (n, 2).
-    rim : float
-        Sine of the angle at the rim of the field of view.
-    widening : float
-        w = dR / dz.
-    bins : int
-        Number of cells along the diameter.
-
-    Notes
-    -----
-    A cap that recedes by dz and widens by w dz sweeps the volume :math:`R^2 [\cos\theta - w (1-\cos\theta)] dz`
-    per solid angle. The area in x / R and y / R is :math:`\cos\theta` times the solid angle. The expectation is
-    scaled to the number of ions in the cells that are completely within the field of view.
+    `rim` is the sine of the angle at the rim of the field of view, `widening` w = dR / dz. A cap that recedes by dz and
+    widens by w dz sweeps the volume :math:`R^2 [\cos\theta - w (1-\cos\theta)] dz` per solid angle. The area in x / R
+    and y / R is :math:`\cos\theta` times the solid angle. The expectation is scaled to the number of ions in the cells
+    that are completely within the field of view.
     """
     bins = check_count(bins, "bins", at_least=1, at_most=10_000)
     edges = np.linspace(-rim, rim, bins + 1)

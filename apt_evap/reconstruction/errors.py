@@ -295,22 +295,10 @@ def errors_of(
     groups: Integers | None = None,
     below: Floats | float = 0.0,
 ) -> ReconstructionErrors:
-    """Fit the linear constants and compare positions with sites.
+    """Fit the linear constants, those of `LINEAR` in `fit`, and compare positions with sites, both (n, 3) [nm].
 
-    Parameters
-    ----------
-    positions : ndarray
-        x, y and depth z [nm], shape (n, 3).
-    angles : ndarray
-        Angles on the cap [degrees], shape (n,).
-    truth : ndarray
-        Sites [nm], shape (n, 3), with z out of the specimen.
-    fit : sequence of str
-        Constants that are fitted, of `LINEAR`; others are ignored.
-    groups : ndarray of int, optional
-        Group of each ion, shape (n,).
-    below : ndarray or float
-        Depth of each ion below the apex [nm], shape (n,), which the factor of the depth leaves as it is.
+    z of positions is the depth, z of sites is out of the specimen. `angles` are those on the cap [degrees], `below` is
+    the depth of each ion below the apex [nm], which the factor of the depth leaves as it is.
     """
     free = free_constants(fit)
     n = len(positions)

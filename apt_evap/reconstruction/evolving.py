@@ -397,22 +397,7 @@ def follow_surface(
     solutes: Sequence[str] = (),
     labels: ArrayLike | None = None,
 ) -> EvolvingReconstruction:
-    """Reconstruct ions by a surface that follows them, see `reconstruct`.
-
-    Parameters
-    ----------
-    hits : Hits
-        Ions in the sequence of evaporation.
-    settings : ReconstructionSettings
-        Resolved settings.
-    ranges, solutes, labels
-        As for `reconstruct`.
-
-    Raises
-    ------
-    ValueError
-        If settings, solutes and labels do not fit together, or the ions are not in sequence.
-    """
+    """Reconstruct ions by a surface that follows them, with resolved settings, see `reconstruct`."""
     if settings.protocol != "cap":
         raise ValueError(f'protocol must be "cap" with shape="evolving", got {settings.protocol!r}')
     cap, rows = cap_reconstruction(hits, settings)

@@ -71,22 +71,10 @@ def found_tip(
     axis: Sequence[float],
     radius: float,
 ) -> Tip:
-    """Tip with the phases where they were found; all lengths in the scale of its radius.
+    """Tip with the phases where they were found; all lengths in the scale of its radius [nm].
 
-    Parameters
-    ----------
-    positions : ndarray
-        Ions [nm], as for `FoundRegion`.
-    ions : IonSequence
-        The same ions on the detector.
-    features : sequence of tuple
-        Names and phases, with the evaporation fields that were found.
-    crystal : Material
-        Crystal of matrix and phases.
-    axis : sequence of float
-        Crystal direction along the axis.
-    radius : float
-        Radius of the apex [nm].
+    `positions` [nm] are as for `FoundRegion`, `ions` the same on the detector; `features` are names and phases, with
+    the evaporation fields that were found. `axis` is a direction of the crystal.
     """
     factor = radius / ions.radius
     parts = [Phase("matrix", crystal)]

@@ -65,18 +65,10 @@ class LocalComposition:
 def local_composition(
     positions: Floats, solute: Booleans, halves: Booleans, neighbours: int, volume: float
 ) -> LocalComposition:
-    """Fraction of a solute about each ion, on a grid with a Gaussian.
+    """Fraction of a solute about each ion at positions (n, 3) [nm], on a grid with a Gaussian.
 
-    Parameters
-    ----------
-    positions : ndarray
-        Positions [nm], shape (n, 3).
-    solute, halves : ndarray of bool
-        Which ions are of the solute, and which are of the first half, shape (n,).
-    neighbours : int
-        Ions within the Gaussian: the variance of the composition is that of so many draws.
-    volume : float
-        Volume of the specimen per ion [nm^3].
+    `halves` are the ions of the first half. The variance of the composition is that of so many draws as there are
+    neighbours in the Gaussian. `volume` is that of the specimen per ion [nm^3].
     """
     choices = [halves, halves & solute, ~halves, ~halves & solute]
     ions, ours, others, theirs = _counted(positions, choices, neighbours, volume)
@@ -115,15 +107,9 @@ def _counted(positions, choices, neighbours, volume):
 def solute_contrast(positions: Floats, solute: Booleans, halves: Booleans, volume: float) -> SoluteContrast:
     r"""Contents of a solute in the matrix and in a phase that is enriched, and their contrast.
 
-    Parameters
-    ----------
-    positions, solute, halves, volume
-        As for `local_composition`.
-
-    Notes
-    -----
-    The number of neighbours is such that both contents are three standard deviations apart, 30 to 250. The noise of the
-    covariance of the halves a and b of k neighbours is :math:`c (1 - c) / (k/2) / \\sqrt{n/k}`.
+    Arguments as for `local_composition`. The number of neighbours is such that both contents are three standard
+    deviations apart, 30 to 250. The noise of the covariance of the halves a and b of k neighbours is :math:`c (1 - c) /
+    (k/2) / \\sqrt{n/k}`.
     """
     share = float(solute.mean())
     found = local_composition(positions, solute, halves, _NEIGHBOURS, volume)
@@ -153,21 +139,8 @@ def contents(found: LocalComposition, neighbours: int) -> tuple[float, float]:
 
 
 def noise_free_slopes(values: Floats, found: list[LocalComposition]) -> Floats:
-    r"""Slopes of values over compositions, without the bias by the noise of the counts.
+    r"""Slopes (k,) of values of ions over their compositions of k solutes, without the bias by the noise of the counts.
 
-    Parameters
-    ----------
-    values : ndarray
-        Values of each ion, shape (n,).
-    found : list of LocalComposition
-        Compositions of the same ions, one of each solute; k of them.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-
-    Notes
-    -----
     The composition a of one half of the neighbours is an instrument for that of the other half, b, because their noise
     is independent: :math:`2\,\mathrm{cov}(a_i, b_j)\,\beta_j = \mathrm{cov}(v, a_i) + \mathrm{cov}(v, b_i)`. The slope
     over the composition of all neighbours is 5 to 10 % smaller at a contrast of 40 %, and a third at 10 %.

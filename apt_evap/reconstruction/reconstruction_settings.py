@@ -188,20 +188,7 @@ class ReconstructionSettings:
 
 
 def resolved_settings(settings: ReconstructionSettings | None, constants: Mapping[str, Any]) -> ReconstructionSettings:
-    """Settings of a function that takes them as an object, as keywords, or both.
-
-    Parameters
-    ----------
-    settings : ReconstructionSettings or None
-        The object.
-    constants : mapping
-        Its fields by name, which replace those of the object.
-
-    Returns
-    -------
-    ReconstructionSettings
-        Without missing numbers, see `ReconstructionSettings.resolved`.
-    """
+    """Complete settings of a function that takes them as an object, as keywords that replace its fields, or both."""
     if settings is None:
         return from_plain(constants, ReconstructionSettings, what="settings of a reconstruction").resolved()
     check_kind(settings, "settings", ReconstructionSettings, "ReconstructionSettings")

@@ -20,22 +20,8 @@ _GAP = 2 * _FINE  # blocks between the beginning of a restart and its end
 
 
 def without_jumps(voltages: Floats, width: float) -> tuple[Floats, int]:
-    """Factor of each voltage that takes out jumps and restarts, and their number.
+    """Factor of each voltage that takes out jumps and restarts, and their number; voltages are means of `width` ions.
 
-    Parameters
-    ----------
-    voltages : ndarray
-        Voltage of each ion, shape (n,).
-    width : float
-        Ions over which the voltage is averaged.
-
-    Returns
-    -------
-    ndarray, int
-        Shape (n,); the number of events.
-
-    Notes
-    -----
     The specimen changes the voltage within a tenth of a nanometre and more of depth, as it evaporates; an instrument at
     once. After a jump all voltages are scaled to the level before. A restart begins lower and recovers: there the
     voltage is interpolated.

@@ -214,13 +214,8 @@ def real_voltages(
 def check_flight_charges(flight_charges: Any, names: tuple[str, ...]) -> dict[str, int] | PostIonisation:
     """Return charges in flight by element, or how they are drawn.
 
-    Parameters
-    ----------
-    flight_charges : None or int or mapping or PostIonisation
-        Usual charges of the elements (`FLIGHT_CHARGES`), one charge for all ions, charges by element, or charges drawn
-        from the local field.
-    names : tuple of str
-        Elements of the species.
+    They are the usual charges of the elements (`FLIGHT_CHARGES`), one charge for all ions, charges by element, or
+    charges drawn from the local field.
     """
     if isinstance(flight_charges, PostIonisation):
         return flight_charges
@@ -242,22 +237,10 @@ def flight_charges_of(
     fields: Floats,
     u: Floats,
 ) -> NDArray[np.int32]:
-    """Charge of each ion in flight, shape (n,).
+    """Charge of each ion in flight [e], int (n,), by the result of `check_flight_charges`.
 
-    Parameters
-    ----------
-    flight_charges : dict or PostIonisation
-        Result of `check_flight_charges`; other elements keep the charge at the barrier.
-    names : tuple of str
-        Elements of the species.
-    species : ndarray of int, shape (n,)
-        Species of each ion.
-    barrier_charges : ndarray of int, shape (n,)
-        Charge of each ion at the barrier [e].
-    fields : ndarray, shape (n,)
-        Field at each evaporation [V/nm].
-    u : ndarray, shape (n,)
-        Random numbers in (0, 1).
+    Other elements keep the charge at the barrier. `fields` are those at each evaporation [V/nm], `u` random numbers in
+    (0, 1).
     """
     if isinstance(flight_charges, PostIonisation):
         least = np.ones(len(names), np.int64)
@@ -271,22 +254,11 @@ def flight_charges_of(
 
 
 def pulses_of(excess: Floats, rate: float, u: Floats) -> Integers:
-    """Number of the pulse of each ion of a run without a clock, int64 of shape (n,).
+    """Number of the pulse of each ion of a run without a clock, int64 (n,), at a rate of ions per pulse.
 
-    Parameters
-    ----------
-    excess : ndarray, shape (n,)
-        Field of each atom before evaporation, relative to the level of the control.
-    rate : float
-        Ions per pulse.
-    u : ndarray, shape (n,)
-        Random numbers in (0, 1).
-
-    Returns
-    -------
-    ndarray
-        An atom that exceeds the level by 1 % leaves in the pulse of the one before, because it was there already. All
-        others wait a geometric number of pulses.
+    `excess` is the field of each atom before evaporation, relative to the level of the control. An atom that exceeds
+    the level by 1 % leaves in the pulse of the one before, because it was there already. All others wait a geometric
+    number of pulses, by random numbers `u` in (0, 1).
     """
     n = len(excess)
     if n == 0:

@@ -72,15 +72,7 @@ def by_material(values: Any, name: str) -> dict[Material, Any]:
 def check_solutes(
     solutes: Mapping[Material, Any] | Mapping[str, Any] | None, *, profiles: bool = True
 ) -> dict[Material, Any]:
-    """Return fractions by Material.
-
-    Parameters
-    ----------
-    solutes : mapping or None
-        Atomic fraction, or `Segregation`, by element (str or Material).
-    profiles : bool
-        Whether a `Segregation` is possible.
-    """
+    """Return fractions by Material; `profiles` tells whether a `Segregation` is possible."""
     fractions: dict[Material, Any] = {}
     if solutes is not None:
         check_kind(solutes, "solutes", Mapping, "a mapping of an element to its atomic fraction")
@@ -98,25 +90,7 @@ def check_solutes(
 
 
 def site_numbers(seed: int, lattice: int, cells: Integers, site: int, use: int) -> Floats:
-    """Random number in (0, 1) of each lattice site.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the specimen.
-    lattice : int
-        Number of the lattice.
-    cells : ndarray of int, shape (3, n)
-        Indices of the cells.
-    site : int
-        Number of the site in each cell.
-    use : int
-        Use of the number, such as `VACANCY`.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-    """
+    """Random number in (0, 1) of a lattice site in each cell of indices (3, n), for a use such as `VACANCY`."""
     state = mix(np.array([check_seed(seed)], dtype=np.uint64) + GAMMA)
     for index in (lattice, site, use, *cells):
         key = np.atleast_1d(np.asarray(index, dtype=np.int64)).view(np.uint64) + np.uint64(1)
@@ -125,18 +99,9 @@ def site_numbers(seed: int, lattice: int, cells: Integers, site: int, use: int) 
 
 
 def choose(numbers: Floats, fractions: list[Any]) -> NDArray[np.int32]:
-    """Index of the fraction that each random number falls into, -1 for none.
+    """Index of the fraction that each random number in (0, 1) falls into, -1 for none, int (n,).
 
-    Parameters
-    ----------
-    numbers : ndarray, shape (n,)
-        Random numbers in (0, 1).
-    fractions : list
-        Fractions, numbers or arrays (n,), with a sum <= 1.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
+    Fractions are numbers or arrays (n,), with a sum <= 1.
     """
     chosen = np.full(len(numbers), -1, dtype=np.int32)
     edge = np.zeros(len(numbers))

@@ -21,24 +21,10 @@ def mean_mass(element: str) -> float:
 
 
 def draw_isotopes(names: Sequence[str], species: ArrayLike, masses: ArrayLike, u: ArrayLike) -> Floats:
-    """Draw the mass of each ion from the natural isotopes of its element.
+    """Mass of each ion [Da], drawn from the natural isotopes of its element by uniform random numbers `u` in (0, 1).
 
-    Parameters
-    ----------
-    names : sequence of str
-        Name of each species.
-    species : array_like of int
-        Species of each ion, shape (n,).
-    masses : array_like
-        Mass of each species [Da], shape (number of species,). It is kept, without isotopes, for a species whose name is
-        not in `ISOTOPES` or whose mass differs from the natural mean by more than 0.1 %, such as an enriched isotope.
-    u : array_like
-        Uniform random numbers in (0, 1), one per ion, shape (n,).
-
-    Returns
-    -------
-    ndarray
-        Mass of each ion [Da], shape (n,).
+    The mass of a species is kept, without isotopes, if its name is not in `ISOTOPES` or its mass differs from the
+    natural mean by more than 0.1 %, such as that of an enriched isotope.
     """
     names = check_sequence(names, "names", "element names")
     masses = check_array(masses, "masses", (len(names),))

@@ -57,14 +57,7 @@ def check_structure(structure: str) -> str:
 def cell_lengths(structure: str, a: float, c: float | None = None) -> Floats:
     """Edges of the conventional right-angled cell [nm], shape (3,).
 
-    Parameters
-    ----------
-    structure : str
-        One of fcc, bcc, sc, diamond, hcp.
-    a : float
-        Lattice constant [nm].
-    c : float, optional
-        Height of the hexagonal cell [nm]; only for hcp; sqrt(8/3) a by default.
+    The height c of a hexagonal cell is sqrt(8/3) a by default.
     """
     if check_structure(structure) == "hcp":
         height = math.sqrt(8 / 3) * a if c is None else check_number(c, "c", above=0, unit="nm")
@@ -93,18 +86,7 @@ def atom_density(structure: str, a: float, c: float | None = None) -> float:
 
 
 def nearest_neighbour_distance(structure: str, a: float, c: float | None = None) -> float:
-    """Distance between nearest neighbours.
-
-    Parameters
-    ----------
-    structure, a, c
-        As for `atom_density`.
-
-    Returns
-    -------
-    float
-        Distance [nm].
-    """
+    """Distance between nearest neighbours [nm]."""
     a = check_number(a, "a", above=0, unit="nm")
     if check_structure(structure) == "hcp":
         height = cell_lengths(structure, a, c)[2]
@@ -124,19 +106,9 @@ def direction_vectors(structure: str, a: float, c: float | None = None) -> Float
 
 
 def check_axis(structure: str, axis: Sequence[float]) -> tuple[int | float, ...]:
-    """Return a crystal direction as a tuple of three numbers, or raise an error that names the argument.
+    """Return a crystal direction, [u v w] or for hcp [u v t w], as a tuple of numbers, or raise an error.
 
-    Parameters
-    ----------
-    structure : str
-        One of fcc, bcc, sc, diamond, hcp.
-    axis : sequence of float
-        Direction [u v w], or for hcp [u v t w] with u + v + t = 0.
-
-    Returns
-    -------
-    tuple
-        Ints without a common factor if all numbers are integers, otherwise the floats unchanged.
+    They are ints without a common factor if all are integers, otherwise the floats unchanged.
     """
     four = structure == "hcp" and np.shape(axis) == (4,)
     try:

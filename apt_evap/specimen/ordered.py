@@ -184,23 +184,7 @@ def check_order(order: Any, structure: str) -> None:
 
 
 def sublattice(order: Superlattice | UnitCell, cells: Integers, site: int, n_sites: int) -> Integers:
-    """Index of the sites of these cells into `occupants`.
-
-    Parameters
-    ----------
-    order : Superlattice or UnitCell
-        The order.
-    cells : ndarray of int, shape (3, n)
-        Cells.
-    site : int
-        Number of the site in each cell.
-    n_sites : int
-        Sites per cell.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-    """
+    """Index into `occupants` of a site in each of the cells with indices (3, n), of `n_sites` per cell, int (n,)."""
     i, j, k = (index % n for index, n in zip(cells, order.period, strict=True))
     return ((i * order.period[1] + j) * order.period[2] + k) * n_sites + site
 

@@ -39,18 +39,7 @@ def pointing(positions: Floats) -> Floats:
 
 
 def warn_of_direction(positions: Floats) -> None:
-    """Warn if a specimen stands upside down, lies on its side or leans; its axis should be +z, with the apex on top.
-
-    Parameters
-    ----------
-    positions : ndarray
-        Atoms [nm], shape (n, 3).
-
-    Warns
-    -----
-    SpecimenWarning
-        Names what was seen.
-    """
+    """Warn if a specimen stands upside down, lies on its side or leans; its axis should be +z, with the apex on top."""
     if len(positions) < _LEAST:
         return
     axis = pointing(positions)
@@ -81,23 +70,8 @@ def warn_of_shape(positions: Floats) -> None:
 def check_spacing(distance: float, expected: Sequence[float], names: Sequence[str], n: int) -> None:
     """Refuse positions in a wrong unit, and warn of other distances between atoms that no crystal of them has.
 
-    Positions in another unit would be simulated at a wrong voltage, without any other sign.
-
-    Parameters
-    ----------
-    distance : float
-        Median distance between an atom and its nearest neighbour [nm].
-    expected : sequence of float
-        Nearest neighbour distance of each species [nm].
-    names : sequence of str
-        Names of the species.
-    n : int
-        Number of atoms; below 50, nothing is checked.
-
-    Warns
-    -----
-    SpecimenWarning
-        If it does not fit in any unit.
+    Positions in another unit would be simulated at a wrong voltage, without any other sign. `distance` is the median
+    from an atom to its nearest neighbour, `expected` that of each species [nm]. Below 50 atoms, nothing is checked.
     """
     low, high = min(expected), max(expected)
     if n < _CROWD or _CLOSE * low <= distance <= _FAR * high:
@@ -120,17 +94,7 @@ def check_spacing(distance: float, expected: Sequence[float], names: Sequence[st
 def warn_of_bodies(positions: Floats, distance: float) -> None:
     """Warn if a specimen is in several pieces, such as a needle that was cut by the borders of a periodic box.
 
-    Parameters
-    ----------
-    positions : ndarray
-        Atoms [nm], shape (n, 3).
-    distance : float
-        Distance between nearest neighbours [nm]; atoms within 1.5 times this distance belong to one body.
-
-    Warns
-    -----
-    SpecimenWarning
-        Names the number of bodies, and the atoms in the largest ones.
+    Atoms within 1.5 times the distance of nearest neighbours belong to one body.
     """
     if len(positions) < _CROWD:
         return
@@ -190,19 +154,9 @@ def upright(positions: Floats) -> Floats:
 
 
 def apex_sphere(positions: Floats) -> tuple[Floats, float] | None:
-    """Sphere through the corners of the convex hull within 45 degrees of the axis.
+    """Centre (3,) and radius [nm] of the sphere through the corners of the convex hull within 45 degrees of the axis.
 
-    Parameters
-    ----------
-    positions : ndarray
-        Atoms [nm], shape (n, 3).
-
-    Returns
-    -------
-    centre : ndarray, shape (3,)
-        Centre of the sphere [nm].
-    radius : float
-        Its radius [nm], to the places of the atoms. None instead of both if fewer than 10 atoms define it.
+    None instead of both if fewer than 10 atoms define it.
     """
     try:
         surface = positions[scipy.spatial.ConvexHull(positions).vertices]

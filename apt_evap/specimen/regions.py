@@ -256,24 +256,7 @@ def with_boundary(region: Any, name: str) -> Any:
 
 
 def contains(region: Any, points: Floats) -> Booleans:
-    """Whether points are in a region; points on its boundary are, up to rounding.
-
-    Parameters
-    ----------
-    region : region or callable
-        A region, or a function of points.
-    points : ndarray, shape (n, 3)
-        [nm].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-
-    Raises
-    ------
-    ValueError
-        If a function does not return booleans of this shape.
-    """
+    """Whether points (n, 3) [nm] are in a region or a function says so; points on the boundary are, up to rounding."""
     if callable(getattr(region, "contains", None)):
         return region.contains(points)
     if callable(getattr(region, "distance", None)):

@@ -88,19 +88,10 @@ def pole_symmetry(material: Any, direction: ArrayLike) -> PoleSymmetry:
 
 
 def symmetry_about_axis(material: Any, orientation: ArrayLike) -> Floats:
-    """Symmetry of a crystal about the axis of a specimen, in the plane across it.
+    """Symmetry of a crystal about the axis of a specimen: orthogonal matrices (n, 2, 2) in the plane across it.
 
-    Parameters
-    ----------
-    material : Material
-        The crystal.
-    orientation : array_like
-        ``orientation @ crystal vector = vector of the specimen``, as from `rotation_to_axis`, shape (3, 3).
-
-    Returns
-    -------
-    ndarray
-        Orthogonal matrices for (x, y), shape (n, 2, 2); 6 for fcc [111], and the identity alone for a general axis.
+    ``orientation @ crystal vector = vector of the specimen``, as from `rotation_to_axis`. There are 6 for fcc [111],
+    and the identity alone for a general axis.
     """
     check_kind(material, "material", Material, "a Material")
     turn = check_array(orientation, "orientation", (3, 3))

@@ -38,12 +38,7 @@ def highest_charge(symbol: str) -> int:
 def molecular_ions(present: frozenset[str], minor: frozenset[str]) -> tuple[Ion, ...]:
     """Molecular ions of the elements that are present: of gases, and of metals with ligands.
 
-    Parameters
-    ----------
-    present : frozenset of str
-        Elements.
-    minor : frozenset of str
-        Elements of few ions: only a single atom of them, with one other.
+    Of `minor` elements, those of few ions, only a single atom with one other.
     """
     ions: dict[Ion, None] = {}
     for text in _GAS_MOLECULES:
@@ -79,14 +74,7 @@ def molecular_ions(present: frozenset[str], minor: frozenset[str]) -> tuple[Ion,
 def ions_between(low: float, high: float, present: Collection[str], own: str) -> list[Ion]:
     """All ions whose most abundant isotopes have an m/n between bounds [Da], of any atoms that may be together.
 
-    Parameters
-    ----------
-    low, high : float
-        Bounds.
-    present : collection of str
-        Elements of molecules, beside hydrogen.
-    own : str
-        An element whose ions are left out.
+    `present` are the elements of molecules, beside hydrogen; the ions of the element `own` are left out.
     """
     found = [ion for ion in atomic_ions([*HIGHEST_CHARGE]) if low < _main_mass(ion.formula) / ion.charge < high]
     metals = sorted({*present} - {*GASES, "D", own})

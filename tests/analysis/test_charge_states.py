@@ -182,8 +182,8 @@ def test_course_of_a_rising_field():
 
 
 @pytest.fixture(scope="module")
-def real(small_tip):
-    run = ae.Simulation(small_tip, seed=3).run(600, responses=False, progress=False)
+def real(small_tip, made_once):
+    run = made_once(small_tip, 600, responses=False, seed=3)
     # a scale at which both charges are frequent
     return run.at_evaporation_field(flight_charges=PostIonisation(0.7))
 

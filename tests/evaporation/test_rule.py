@@ -198,13 +198,14 @@ def test_a_law_can_see_the_field_of_the_others(small_tip):
         for rule, name in zip(CONSTANT, NAMES, strict=True)
     ],
 )
-def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, tmp_path, rule):
+def test_bits_do_not_depend_on_threads_batches_and_resumes(small_tip, made_once, tmp_path, rule):
     settings = ae.evaporation.ChargeSettings(sweep_interval=15)
+    options = {"rule": rule, "charge_settings": settings, "seed": 1}
 
-    def simulation(**options):
-        return ae.Simulation(small_tip, rule=rule, charge_settings=settings, seed=1, **options)
+    def simulation(**threads):
+        return ae.Simulation(small_tip, **options, **threads)
 
-    whole = simulation(n_threads=1).run(50, progress=False)
+    whole = made_once(small_tip, 50, n_threads=1, **options)
     assert whole.fingerprint() == simulation(n_threads=2).run(50, progress=False).fingerprint()
     checkpoint = ae.simulation.Checkpoint(tmp_path / "a.h5", resume=True)
     simulation().run(20, progress=False, checkpoint=checkpoint)

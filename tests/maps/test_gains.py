@@ -63,6 +63,7 @@ def test_noise_reaches_no_level():
     "numbers, level",
     [
         ((4, 4, 4), "alike"),
+        ((2, 4, 4), "same orientation"),
         ((-1, 4, 4), "same orientation"),
         ((9, 4, 2), "orientation about the pole"),
         ((9, 2, 9), "none"),

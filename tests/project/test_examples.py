@@ -36,7 +36,7 @@ PACKAGE = Path(ae.__file__).parent
 def of_modules():
     """Module and name of each function or class with an example, but for the public ones."""
     public = {id(attrgetter(name)(ae)) for name in NAMES}
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted(path for path in PACKAGE.rglob("*.py") if ">>>" in path.read_text()):
         module = ".".join(("apt_evap", *path.relative_to(PACKAGE).with_suffix("").parts))
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and ">>>" in (ast.get_docstring(node) or ""):

@@ -130,6 +130,7 @@ def test_pulses_have_the_wanted_rate(rng):
     assert len(excess) / pulses[-1] == pytest.approx(0.01, rel=0.03)
     assert np.array_equal(np.diff(pulses) == 0, excess[1:] > 1.01)
     assert pulses_of(np.empty(0), 0.01, np.empty(0)).shape == (0,)
+    assert pulses_of(np.array([1.5, 1.5, 0.9]), 0.5, np.full(3, 0.999)).tolist() == [1, 1, 2]  # none before the first
 
 
 def test_multiplicities_count_the_detected_ions_of_a_pulse(real):

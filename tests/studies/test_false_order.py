@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
+from apt_evap._common.types import Estimated
+from apt_evap.studies.visibility.false_order import FalseOrder
 
 
 @pytest.fixture(scope="module")
-def alloy():
+def alloy(made_once):
     nickel = ae.material("Ni")
     phase = ae.specimen.Phase("alloy", nickel, solutes={"Al": 0.1}, evaporation_field=nickel.evaporation_field)
     tip = ae.Tip(phases=[phase], apex_radius=3.0, axis=(1, 1, 1), shank_length=3.0, seed=1, offset_seed=1)
-    return ae.Simulation(tip, seed=1, n_threads=1).run(3000, [ae.Unperturbed()], responses=False, progress=False)
+    return made_once(tip, 3000, [ae.Unperturbed()], responses=False, seed=1, n_threads=1)
 
 
 @pytest.mark.slow
@@ -22,8 +24,12 @@ def test_a_random_alloy_with_equal_fields_has_no_order(alloy):
     assert abs(order.shuffled.value) < 3.5 * order.shuffled.error / np.sqrt(50)
     # the bootstrap and the permutations agree on the error of a random alloy; both have errors of 20 %
     assert order.true.error == pytest.approx(order.shuffled.error, rel=0.6)
-    x = order.solutes / order.ions
-    assert order.unlike.value == pytest.approx(-order.reconstructed.value * x / (1 - x))
+
+
+def test_the_parameter_of_unlike_pairs():
+    like = Estimated(-0.2, 0.05)
+    order = FalseOrder(like, like, like, ions=500, solutes=100)
+    assert order.unlike == pytest.approx((0.2 * 0.2 / 0.8, 0.05 * 0.2 / 0.8))  # -alpha x / (1 - x)
 
 
 @pytest.mark.parametrize(

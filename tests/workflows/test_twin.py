@@ -273,6 +273,11 @@ def test_the_digest_is_recorded_before_the_file(tmp_path):
     kept.write({"a": b"1"})
     again = KeptFiles(tmp_path / "t", {"FILE": one, "scales": [1.0, 2.0]}, ["a"])
     assert again.has("a") and again.read("a") == b"1"
+    (tmp_path / "t" / "a").rename(tmp_path / "elsewhere")
+    (tmp_path / "t" / "a").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ae.FileError, match="a' was not made by this command"):
+        again.has("a")
+    (tmp_path / "elsewhere").replace(tmp_path / "t" / "a")
     again.forget("a")
     assert os.listdir(tmp_path / "t") == [RECORD]
     with pytest.raises(ae.FileError, match="another FILE"):

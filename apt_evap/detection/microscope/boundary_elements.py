@@ -62,19 +62,9 @@ def joined(*parts: Panels) -> Panels:
 
 
 def ring_potential(rho: Floats, z: Floats, radius: Floats, height: Floats) -> Floats:
-    """Potential of rings with the charge 1.
+    """Potential [1/nm] at points (rho, z) of rings with the charge 1, radius and height in nm; all are broadcast.
 
-    Parameters
-    ----------
-    rho, z : ndarray
-        Points [nm].
-    radius, height : ndarray
-        Radii and z of the rings [nm]; all arguments are broadcast.
-
-    Returns
-    -------
-    ndarray
-        2/pi K(m) / s with s^2 = (rho + radius)^2 + (z - height)^2, [1/nm].
+    It is 2/pi K(m) / s with s^2 = (rho + radius)^2 + (z - height)^2.
     """
     far = (rho + radius) ** 2 + (z - height) ** 2
     near = (rho - radius) ** 2 + (z - height) ** 2

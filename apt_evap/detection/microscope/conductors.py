@@ -38,18 +38,10 @@ def straight_flank(radius: float, angle: float, length: float) -> Flank:
 
 
 def measured_flank(radius: float, profile: Floats, angle: float, length: float) -> Flank:
-    """Flank of a cap that touches a measured profile, and of a cone below the profile.
+    """Flank of a cap that touches a measured profile, and of a cone of this half opening angle [rad] below the profile.
 
-    Parameters
-    ----------
-    radius : float
-        Radius of the cap [nm].
-    profile : ndarray
-        Distance from the initial apex and radius of the shank [nm], shape (n, 2), both increasing.
-    angle : float
-        Half the opening angle of the cone below the profile [rad].
-    length : float
-        Length of the shank [nm].
+    `profile` has the distance from the initial apex and the radius of the shank [nm], shape (n, 2), both increasing.
+    `length` is that of the shank [nm].
     """
     depths, radii = profile.T
     curve = scipy.interpolate.PchipInterpolator(depths, radii)
@@ -100,14 +92,8 @@ def specimen(radius: float, flank: Flank, refinement: int = 1) -> Panels:
 def electrode(distance: float, aperture: float, angle: float, refinement: int = 1) -> Panels:
     """Panels of a cone with an aperture, at the potential 0.
 
-    Parameters
-    ----------
-    distance, aperture : float
-        z and radius of the aperture [nm].
-    angle : float
-        Half the opening angle of the cone [rad]: pi/2 for a plane.
-    refinement : int
-        Factor of the number of panels.
+    z and radius of the aperture are in nm, the half opening angle of the cone in rad: pi/2 for a plane. `refinement` is
+    a factor of the number of panels.
     """
     length = _ELECTRODE_SIZE * max(distance, aperture) / math.sin(angle)
     rim = np.array([aperture, distance])
@@ -126,20 +112,10 @@ def graded(path: Floats, first: float, growth: float) -> Floats:
 
 
 def simulated_flank(radius: float, angle: float, centre: float, foot: float, rounded: bool) -> Flank:
-    """Flank of a simulated specimen, which ends after a short shank.
+    """Flank of a simulated specimen, which ends after a short shank of this half opening angle [rad].
 
-    Parameters
-    ----------
-    radius : float
-        Radius of the cap [nm].
-    angle : float
-        Half the opening angle of the shank [rad].
-    centre : float
-        Distance of the centre of the foot from that of the cap [nm]; the flat base is cut there.
-    foot : float
-        Radius of the foot, a sphere that touches the shank [nm].
-    rounded : bool
-        Whether the foot is rounded; otherwise its base is flat.
+    `foot` is the radius of a sphere that touches the shank, its centre is at the distance `centre` from that of the cap
+    [nm]. The specimen ends there in a flat base unless it is `rounded`.
     """
     sin, cos = math.sin(angle), math.cos(angle)
     start = [radius * cos, radius * (sin - 1)]

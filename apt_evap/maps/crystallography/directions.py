@@ -153,42 +153,14 @@ def _crystal(thing):
 
 
 def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -> Floats:
-    """Unit normals of lattice planes, in the frame of the crystal.
-
-    Parameters
-    ----------
-    material : Material
-        The crystal.
-    planes : array_like
-        Miller indices (h k l), shape (n, 3), or for hcp also (h k i l) with h + k + i = 0, shape (n, 4).
-    name : str
-        Name of the argument, for the message.
-
-    Returns
-    -------
-    ndarray
-        Shape (n, 3).
-    """
+    """Unit normals (n, 3) of lattice planes (h k l), for hcp also (h k i l), in the frame of the crystal."""
     planes = _three(material, planes, name, lambda h, k, _, last: (h, k, last))
     normals = planes @ _reciprocal(material)
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def direction_normals(material: Material, directions: ArrayLike) -> Floats:
-    """Unit vectors along lattice directions, in the frame of the crystal.
-
-    Parameters
-    ----------
-    material : Material
-        The crystal.
-    directions : array_like
-        [u v w], shape (n, 3), or for hcp also [u v t w] with u + v + t = 0, shape (n, 4).
-
-    Returns
-    -------
-    ndarray
-        Shape (n, 3).
-    """
+    """Unit vectors (n, 3) along directions [u v w], for hcp also [u v t w], in the frame of the crystal."""
     directions = _three(material, directions, "directions", lambda u, v, t, w: (u - t, v - t, w))
     vectors = directions @ lattice.direction_vectors(material.structure, material.a, material.c)
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]

@@ -56,24 +56,11 @@ _FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms a
 def local_contrast(
     values: np.ndarray, mask: np.ndarray, narrow: Floats, wide: Floats, used: np.ndarray | None = None
 ) -> np.ndarray:
-    """Contrast of an image in units of its local standard deviation.
+    """Contrast of images (..., ny, nx) of values from 0 in units of their local standard deviation.
 
-    Parameters
-    ----------
-    values : ndarray
-        The image, at least 0, or several, shape (..., ny, nx).
-    mask : ndarray
-        Which pixels count, shape (ny, nx).
-    narrow, wide : array_like
-        Standard deviations along both axes [pixels].
-    used : ndarray, optional
-        Pixels of the median, by default `mask`.
-
-    Returns
-    -------
-    ndarray
-        The ratio of its means in both Gaussians, minus one, between -1 and 1, divided by the square root of its mean
-        square in the wide one, which is at least half its median.
+    The ratio of the means in a narrow and a wide Gaussian (standard deviations along both axes [pixels]), minus one,
+    between -1 and 1, is divided by the square root of its mean square in the wide one, which is at least half its
+    median over the pixels `used`, by default those of the mask.
     """
     fine, slow = (_mean(values, mask, sigma) for sigma in (narrow, wide))
     least = 1e-6 * np.maximum(slow.max(axis=(-2, -1), keepdims=True), 1e-30)
@@ -212,24 +199,11 @@ def terms_of(material: Material) -> Terms:
 
 
 def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> Floats:
-    """Evidence E of pictures for the terms of a model, see the module.
+    """Evidence E of m pictures for k terms of a model, shape (..., m), see the module.
 
-    Parameters
-    ----------
-    gram : ndarray
-        Products G of the terms, means over the disc, shape (..., k, k).
-    cross : ndarray
-        Products of the terms with m pictures of a variance of 1, shape (..., k, m).
-    priors : ndarray
-        Standard deviations of the amplitudes, shape (k,).
-    signed : ndarray
-        Which amplitudes may be negative, shape (k,).
-
-    Returns
-    -------
-    ndarray
-        Shape (..., m). Amplitudes of the largest likelihood that may not be negative and are, are set to 0, the others
-        are kept: what is explained is then at least this.
+    `gram` has the products G of the terms, means over the disc, (..., k, k), `cross` those with pictures of a variance
+    of 1, (..., k, m), `priors` the standard deviations of the amplitudes. Amplitudes of the largest likelihood that may
+    not be negative (`signed`) and are, are set to 0, the others are kept: what is explained is then at least this.
     """
     ridge = gram + np.diag(1 / (PIECES * priors**2))
     amplitudes = np.linalg.solve(ridge, cross)
@@ -272,18 +246,7 @@ def refine_contrast(
 ) -> Explained:
     """Maximise the evidence near a start by Gauss-Newton steps; the amplitudes follow.
 
-    Parameters
-    ----------
-    picture : ndarray
-        That of the map, of `picture_of`.
-    radius : float
-        Radius of the field of view [mm].
-    terms : Terms
-        Those of the crystal.
-    start : Start
-        Orientation and scale.
-    bounds : tuple of float
-        Bounds of the scale [mm/rad].
+    The radius is that of the field of view [mm], the bounds are those of the scale [mm/rad].
     """
     places, areas = places_of()
     limits = np.log(bounds)

@@ -267,20 +267,8 @@ def surrogates_of(
 ) -> Surrogates:
     """Weights of surrogates of a map.
 
-    Parameters
-    ----------
-    view : View
-        The map.
-    search : JointSearch
-        Of the map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    densities : ndarray
-        Densities of its patterns, smoothed for the bins, shape (k, m, m).
-    bounds : tuple of float
-        Smallest and largest scale [mm/rad].
-    fit : Refined
-        The best orientation of the map.
+    `densities` are those of the patterns, smoothed for the bins, shape (k, m, m), `bounds` those of the scale [mm/rad],
+    `fit` is the best orientation of the map.
     """
     disc, bins, picture = view
     polar = _polar(bins)

@@ -87,16 +87,9 @@ class Mark(NamedTuple):
 
 
 def marks_of(material: Material, marked_poles: Sequence[Any], marked_lines: Sequence[Any]) -> tuple[Mark, ...]:
-    """Check the marks of a user.
+    """Check the marks of a user [mm].
 
-    Parameters
-    ----------
-    material : Material
-        The crystal.
-    marked_poles : sequence
-        (x, y) or (x, y, indices) [mm].
-    marked_lines : sequence
-        (x, y, x, y) of the ends, or (x, y, x, y, indices) of the zone axis.
+    Poles are (x, y) or (x, y, indices), lines (x, y, x, y) of their ends or (x, y, x, y, indices of the zone axis).
     """
     marks = []
     known = poles(material, _FAMILIES)
@@ -158,17 +151,7 @@ def check_places(marks: Sequence[Mark], map: DetectorMap, radius: float) -> None
 
 
 def contradictory_pair(marks: Sequence[Mark], centre: Sequence[float], scales: tuple[float, float]) -> str:
-    """Two marked poles whose angle differs from those between their planes at any scale; "" if there are none.
-
-    Parameters
-    ----------
-    marks : sequence of Mark
-        Marks of a user.
-    centre : sequence of float
-        Centre of the projection [mm].
-    scales : tuple of float
-        Bounds of the scale [mm/rad].
-    """
+    """Two marked poles whose angle differs from those of their planes at any scale [mm/rad]; "" if there are none."""
     places = [mark for mark in marks if not mark.is_line]
     for first, second in combinations(places, 2):
         angles = []

@@ -199,19 +199,9 @@ def nearest_pixels(directions: Floats) -> tuple[np.ndarray, np.ndarray]:
 
 
 def mixture(patterns: Sequence[MasterPattern], amplitudes: Floats) -> MasterPattern:
-    """Mean of patterns of several radii.
+    """Mean of patterns of one structure and several radii, with amplitudes (2 n,) of their two densities.
 
-    Parameters
-    ----------
-    patterns : sequence of MasterPattern
-        Patterns of one structure.
-    amplitudes : ndarray
-        Of the two densities of each pattern, shape (2 n,).
-
-    Returns
-    -------
-    MasterPattern
-        With the mean of the logarithms of their radii.
+    Its radius is the mean of the logarithms of theirs.
     """
     parts = np.asarray(amplitudes, float).reshape(-1, 2) + 1e-9  # equal ones, if there is none
     weights = parts / parts.sum(axis=0)

@@ -221,16 +221,8 @@ def distinct_starts(
 ) -> list[Start]:
     """The best results of a search that are more than two steps from a better one.
 
-    Parameters
-    ----------
-    scored : list of tuple
-        Score, scale [mm/rad], turn of the axis, whether mirrored, and azimuth [rad] of each result; it is sorted.
-    proper : ndarray
-        Rotations of the point group, shape (n, 3, 3).
-    n_max : int
-        Largest number of results.
-    axis_step, scale_step : float
-        Steps of the search: of the axes [degrees], and of the logarithm of the scale.
+    Steps are those of the axes [degrees] and of the logarithm of the scale. A result is its score, scale [mm/rad], turn
+    of the axis, whether mirrored, and azimuth [rad]. `proper` are the rotations of the point group, shape (n, 3, 3).
     """
     scored.sort(key=lambda entry: -entry[0])
     starts: list[Start] = []

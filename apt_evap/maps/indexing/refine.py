@@ -326,24 +326,9 @@ def refine(
 ) -> Refined:
     """Maximise the likelihood near a start.
 
-    Parameters
-    ----------
-    bins : Bins
-        The map.
-    disc : Disc
-        Its disc.
-    densities : ndarray
-        Densities of the master patterns, smoothed for the size of the bins, shape (k, m, m).
-    matrix, scale
-        Start: rotation from crystal to specimen, scale [mm/rad].
-    amplitudes : ndarray, optional
-        Start of the amplitudes, shape (k,); by default equal ones.
-    marks : sequence of Mark
-        Marks of a user.
-    steps : int
-        Largest number of iterations.
-    bounds : tuple of float, optional
-        Bounds of the scale at the centre [mm/rad].
+    It is a rotation from crystal to specimen, a scale [mm/rad], and amplitudes (k,), by default equal ones. `densities`
+    are those of the master patterns, smoothed for the size of the bins, shape (k, m, m); `steps` is the largest number
+    of iterations, `bounds` are those of the scale at the centre [mm/rad].
     """
     geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
     if bounds is not None:

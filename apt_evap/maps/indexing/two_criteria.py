@@ -55,17 +55,7 @@ def view_of(disc: Disc) -> View:
 
 
 def angle_between(first: Refined | Explained, second: Refined | Explained, group: Floats, radius: float) -> float:
-    """Angle between the crystal directions that two results give to the places of a disc, its RMS [degrees].
-
-    Parameters
-    ----------
-    first, second : Refined or Explained
-        The results.
-    group : ndarray
-        Point group of the crystal, shape (n, 3, 3).
-    radius : float
-        Of the disc [mm].
-    """
+    """RMS angle [degrees] between the crystal directions that two results give to the places of a disc [mm]."""
     places, areas = (values[::_EVERY] for values in places_of())
     one, two = (directions_of(places, radius, fit.scale, fit.stretch) @ fit.matrix for fit in (first, second))
     cosines = np.einsum("gij,nj,ni->gn", group, two, one)
@@ -83,26 +73,10 @@ def weighed(
     marks: Sequence[Mark] = (),
     known: dict[tuple, Any] | None = None,
 ) -> list[Weighed]:
-    """Refine orientations by both criteria.
+    """Refine orientations by both criteria, the `n` best ones by each of them to the end.
 
-    Parameters
-    ----------
-    view : View
-        The map.
-    terms : Terms
-        Those of the local contrast of the crystal.
-    densities : ndarray
-        Densities of its patterns, smoothed for the bins, shape (k, m, m).
-    starts : sequence of Start
-        Orientations.
-    n : int
-        Number of the best ones by each criterion that are refined to the end.
-    bounds : tuple of float
-        Smallest and largest scale [mm/rad].
-    marks : sequence of Mark
-        Marks of a user.
-    known : dict, optional
-        Refinements of the same map and crystal that are known already; those of this call are added.
+    `densities` are those of the patterns, smoothed for the bins, shape (k, m, m), `bounds` those of the scale [mm/rad].
+    `known` are refinements of the same map and crystal; those of this call are added.
     """
     disc, bins, picture = view
     group = point_group(terms.structure)

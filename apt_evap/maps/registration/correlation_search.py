@@ -121,24 +121,10 @@ def spectra(values: Any, inside: Any, size: int) -> Any:
 
 
 def correlate(moving: Any, fixed: Any, size: int) -> tuple[Floats, Floats]:
-    """Correlation coefficients of two images in their common area, for all shifts.
+    """Correlation coefficients and numbers of common pixels of two images for all shifts, each of shape (size, size).
 
-    Parameters
-    ----------
-    moving, fixed : ndarray
-        `spectra` of the images.
-    size : int
-        Padded length of the sides.
-
-    Returns
-    -------
-    coefficients, shared : ndarray, shape (size, size)
-        For every shift of the first image in y and x, the correlation coefficient and the number of common pixels;
-        negative shifts count from the end.
-
-    Notes
-    -----
-    Padfield, IEEE Trans. Image Process. 21, 2706 (2012).
+    The images are `spectra`; negative shifts of the first image in y and x count from the end. Padfield, IEEE Trans.
+    Image Process. 21, 2706 (2012).
     """
     pairs = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
     products = np.stack([np.conj(moving[i]) * fixed[j] for i, j in pairs])
@@ -160,23 +146,9 @@ def search(
     least: float,
     shift_bounds: ShiftBounds | None = None,
 ) -> list[Fit]:
-    """Find the best shift for every rotation, scale and mirror.
+    """Find the best shift for every rotation [degrees], scale and mirror; the best fit first.
 
-    Parameters
-    ----------
-    simulated, measured : View
-        The maps.
-    rotations, scales, mirrors : sequence
-        Values to try: [degrees], numbers, bools.
-    least : float
-        Smallest common fraction of the measured field of view.
-    shift_bounds : ShiftBounds, optional
-        Bounds of the shift.
-
-    Returns
-    -------
-    list of Fit
-        Sorted, the best first.
+    `least` is the smallest common fraction of the measured field of view.
     """
     pixel, broad = measured.diameter / COARSE, BROAD * measured.diameter
     grid = _square(measured.reach, pixel)
@@ -245,22 +217,9 @@ def refine(
     scales: tuple[float, ...] | None = None,
     shift_bounds: ShiftBounds | None = None,
 ) -> Fit:
-    """Maximise the correlation near a transform.
+    """Maximise the correlation near a transform, with this number of pixels across the measured field of view.
 
-    Parameters
-    ----------
-    simulated, measured : View
-        The maps.
-    transform : SimilarityTransform
-        Start of the search.
-    pixels : int
-        Pixels across the measured field of view.
-    least : float
-        Smallest common fraction of the measured field of view.
-    rotations, scales : tuple of float, optional
-        Lower and upper bound; equal bounds fix the value.
-    shift_bounds : ShiftBounds, optional
-        Bounds of the shift.
+    `least` is its smallest common fraction; equal bounds of rotations or scales fix the value.
     """
     pixel, broad = measured.diameter / pixels, BROAD * measured.diameter
     points = _square(measured.reach, pixel) + measured.centre

@@ -18,23 +18,9 @@ _FILLED = 0.7  # fraction of a patch inside both maps
 def patch_displacements(
     simulated: View, measured: View, inverse_points: Callable[[Any, Any], Any], scale: float
 ) -> tuple[Any, Any, Floats]:
-    """Places of patches by a registration, their places on the measured map, and weights.
+    """Places of patches by a registration, their places on the measured map, complex (n,) [mm], and weights.
 
-    Parameters
-    ----------
-    simulated, measured : View
-        The maps.
-    inverse_points : callable
-        `Registration.inverse_points`.
-    scale : float
-        Scale of the registration.
-
-    Returns
-    -------
-    centres, targets : ndarray
-        Complex of shape (n,) [mm].
-    weights : ndarray
-        r^2 / (1 - r^2) of the correlation coefficient r, shape (n,).
+    A weight is r^2 / (1 - r^2) of the correlation coefficient r.
     """
     pixel, broad = measured.diameter / FINE, BROAD * measured.diameter
     fixed = measured.flatten(NARROW * pixel, broad)

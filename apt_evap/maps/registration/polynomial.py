@@ -107,17 +107,10 @@ class PolynomialFit(NamedTuple):
 
 
 def fit_polynomial(source: Any, target: Any, degree: int | None, weights: ArrayLike | None = None) -> PolynomialFit:
-    """Fit a similarity transform and polynomial terms to pairs of points.
+    """Fit a similarity transform and polynomial terms to pairs of points, complex (n,) [mm].
 
-    Parameters
-    ----------
-    source, target : ndarray
-        The same points in both frames, complex of shape (n,) [mm].
-    degree : int, optional
-        Degree of the polynomial, 0 to 3. By default the largest one whose terms, compared with the next lower degree
-        with enough points, are significant by an F test at 1 %, and reduce the residual of points that are left out.
-    weights : array_like, optional
-        Weights of the points, shape (n,); by default equal.
+    The degree is 0 to 3. By default it is the largest one whose terms, compared with the next lower degree with enough
+    points, are significant by an F test at 1 %, and reduce the residual of points that are left out.
     """
     source, target = np.asarray(source, complex), np.asarray(target, complex)
     n = len(source)

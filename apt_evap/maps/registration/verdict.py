@@ -113,19 +113,9 @@ def likeness(
 
 
 def symmetric_places(orientation: Orientation | None, projection: Projection | None) -> list[tuple[float, float]]:
-    """Places of the poles with a rotational symmetry near the axis of a specimen, for `likeness`.
+    """Places [mm] of the poles with a rotational symmetry near the axis of a specimen, the highest first.
 
-    Parameters
-    ----------
-    orientation : Orientation or None
-        Orientation of the crystal.
-    projection : Projection or None
-        From directions in the specimen onto the simulated map.
-
-    Returns
-    -------
-    list of (float, float)
-        The highest symmetry first [mm]; the axis alone if one of the arguments is None, or there is no such pole.
+    The axis alone without an orientation or a projection onto the simulated map, or if there is no such pole.
     """
     if orientation is None or projection is None:
         return [(0.0, 0.0)]

@@ -234,21 +234,7 @@ def paragraph(text: str, kind: str = "") -> str:
 
 
 def table(rows: Iterable[Sequence[object]], head: Sequence[object] = (), best: int | None = None) -> str:
-    """Table whose first column names the rows.
-
-    Parameters
-    ----------
-    rows : iterable of sequence
-        Texts or numbers.
-    head : sequence, optional
-        Names of the columns.
-    best : int, optional
-        Number of the row to emphasise.
-
-    Returns
-    -------
-    str
-    """
+    """Table whose first column names the rows; `best` is the number of a row to emphasise."""
     lines = ['<div class="scroll"><table>']
     if head:
         lines.append(f"<thead><tr>{''.join(f'<th>{escape(name)}</th>' for name in head)}</tr></thead>")
@@ -271,19 +257,7 @@ def color_scale(colors: Sequence[str], low: str, high: str, label: str) -> str:
 
 
 def switched(pictures: Sequence[str], beside: bool = False) -> str:
-    """Pictures on one place, switched by a press or a key, str; side by side without a script.
-
-    Parameters
-    ----------
-    pictures : sequence of str
-        Pictures, as HTML.
-    beside : bool
-        Whether they are side by side until then.
-
-    Returns
-    -------
-    str
-    """
+    """Pictures, as HTML, on one place, switched by a press or a key; side by side without a script, or until then."""
     both = ' <button type="button" class="both">side by side (S)</button>' if beside else ""
     controls = (
         '<p><button type="button" class="switch">on one place (B)</button> '

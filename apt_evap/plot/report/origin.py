@@ -30,27 +30,7 @@ def describe_file(path: AnyPath) -> dict[str, Any]:
 
 
 def origin(files: Sequence[AnyPath] = (), command: str = "", messages: Sequence[str] = ()) -> dict[str, Any]:
-    """Origin of a report of this process, in the types of JSON.
-
-    Parameters
-    ----------
-    files : sequence of str or path-like
-        Files that the results were computed from.
-    command : str
-        The command line.
-    messages : sequence of str
-        Warnings of the command.
-
-    Returns
-    -------
-    dict
-        "made_by", "created", "command", "files", "warnings" and "system".
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read.
-    """
+    """Origin of a report of this process, for JSON: files that it was computed from, command line and its warnings."""
     return {
         "made_by": f"apt_evap {__version__}",
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),

@@ -22,18 +22,10 @@ def blinking_pictures(
     width: float = 5.4,
     crystal: tuple[Orientation, Any] | None = None,
 ) -> str:
-    """Maps side by side, which a press or a key puts on one place, as HTML.
+    """Maps of the same bins side by side, which a press or a key puts on one place, as HTML.
 
-    Parameters
-    ----------
-    page : Page
-        Page of the pictures.
-    maps : dict
-        Maps by title, with the same bins. The region is the mask of the first one.
-    width : float
-        Width of a picture [inch].
-    crystal : tuple, optional
-        Orientation of a crystal and its projection, whose poles are drawn on all maps.
+    The region is the mask of the first one, `width` that of a picture [inch]. With a crystal, its orientation and
+    projection, poles are drawn on all maps.
     """
     first = next(iter(maps.values()))
     rows, columns = (np.flatnonzero(first.mask.any(axis=axis)) for axis in (1, 0))

@@ -38,20 +38,11 @@ _MAX_BYTES = 1 << 22  # of a module
 
 
 def with_own_objects(document: Mapping[str, Any], folder: Path | None) -> dict[str, Any]:
-    """Make the objects of the user's own classes that settings name.
+    """Settings with an object for each table whose name is a class of the user's own, ``module:Class``.
 
-    Parameters
-    ----------
-    document : mapping
-        Content of a settings file.
-    folder : Path or None
-        Where ``module.py`` may be, besides the Python path. None: nothing is imported.
-
-    Returns
-    -------
-    dict
-        The document, with an object for each table of a law, a rule, bonds, a perturbation, a distribution of energies,
-        a probability or a region whose name is ``module:Class``; its other entries are the arguments of the class.
+    These are tables of a law, a rule, bonds, a perturbation, a distribution of energies, a probability or a region;
+    their other entries are the arguments of the class. ``module.py`` may be in the folder, besides the Python path;
+    without a folder nothing is imported.
     """
     return {key: _with_objects(value, key, folder) for key, value in document.items()}
 

@@ -101,17 +101,7 @@ _CLASSES: dict[str, tuple[Any, ...]] = {
 
 
 def config_of(document: dict[str, Any], path: Path, *, own_classes: bool = False) -> Config:
-    """Settings of a simulation from the content of a TOML file.
-
-    Parameters
-    ----------
-    document : dict
-        The tables, as in `read_config`.
-    path : Path
-        Name of the file, for messages.
-    own_classes : bool
-        Whether modules with classes of one's own are imported, as in `read_config`.
-    """
+    """Settings of a simulation from the tables of a TOML file, see `read_config`; its path is for messages."""
     with located(path):
         check_switch(own_classes, "own_classes")
         key = key_of(document)

@@ -249,17 +249,7 @@ class FlightPool:
 
 
 def fly_at_rest(emitter: Emitter, positions: Floats, settings: FlightSettings) -> Ends:
-    """Fly ions that start at rest in the present field of an emitter, which does not change.
-
-    Parameters
-    ----------
-    emitter : Emitter
-        The charged surface.
-    positions : ndarray, shape (n, 3)
-        Start of each ion [nm].
-    settings : FlightSettings
-        Accuracy and end of the flights.
-    """
+    """Fly ions that start at rest at positions (n, 3) [nm] in the field of an emitter, which does not change."""
     n, tree = len(positions), emitter.tree
     end, outcome, counter = np.empty((n, 7)), np.empty(n, np.int8), np.zeros(1, np.int64)
     event = np.full(n, -1, np.int64)  # before the first event of the journal: nothing is replayed

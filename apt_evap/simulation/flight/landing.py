@@ -26,25 +26,11 @@ class Ends(NamedTuple):
 
 
 def land(ends: Ends, slowness: Floats, detector: Detector, apex: float) -> tuple[Floats, Floats]:
-    """Continue flights in a straight line from the end of the field to the detector.
+    """Continue m flights of each of n ions in a straight line from the end of the field to the detector.
 
-    Parameters
-    ----------
-    ends : Ends
-        Ends of m launches of each of n ions.
-    slowness : ndarray, shape (n,)
-        Time of flight per reduced time, see `Emissions.slowness`.
-    detector : Detector
-        The detector.
-    apex : float
-        z of the apex [nm].
-
-    Returns
-    -------
-    directions : ndarray, shape (n, m, 2)
-        Stereographic directions, see `Detector.directions`; NaN for an ion that never left.
-    times : ndarray, shape (n, m)
-        Times of flight [ns]; NaN for an ion that never left.
+    `slowness` (n,) is the time of flight per reduced time, see `Emissions.slowness`, `apex` the z of the apex [nm]. The
+    results are stereographic directions (n, m, 2), see `Detector.directions`, and times of flight (n, m) [ns], NaN for
+    an ion that never left.
     """
     n, m = ends.left.shape
     left = ends.left.ravel()

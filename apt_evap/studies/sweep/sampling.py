@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
+import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import did_you_mean, short_text
@@ -25,7 +25,6 @@ _DIGITS = 6  # of a drawn number: the same text, and the same key of a point, on
 _DECIMALS = 5  # of a random axis: 0.001 degrees
 _BITS = 30  # of Sobol' points: 1e9 samples
 _LENGTH = re.compile(r"\s*([-+.\deE]+)\s*(a|nm)\s*")
-_SCRAMBLED_BY = "rng" if "rng" in inspect.signature(qmc.Sobol).parameters else "seed"  # since SciPy 1.15
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,9 @@ def sobol(n: int, width: int, seed: int) -> Floats:
     """
     if not width:
         return np.empty((n, 0))
-    sequence = qmc.Sobol(width, scramble=True, bits=_BITS, **{_SCRAMBLED_BY: np.random.default_rng(seed)})
+    kind = scipy.stats.qmc.Sobol  # loaded here: it takes as long as all else that a study needs
+    scrambled_by = "rng" if "rng" in inspect.signature(kind).parameters else "seed"  # since SciPy 1.15
+    sequence = kind(width, scramble=True, bits=_BITS, **{scrambled_by: np.random.default_rng(seed)})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the balance of a power of 2 is lost on purpose
         return sequence.random(n)
