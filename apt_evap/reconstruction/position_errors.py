@@ -17,7 +17,7 @@ from apt_evap.reconstruction.evolving_surface import IonSequence
 
 CONSTANT_ERRORS: Mapping[str, float] = {"compression": 0.05, "radius": 0.05, "efficiency": 0.05}
 """Relative standard errors of the constants where none are given."""
-LOCAL_SCATTER = (0.18, 0.06)
+LOCAL_SCATTER = (0.174, 0.057)
 """Scatter of ions along the surface, in each of two directions, and across it [nm]: aluminium, 12 nm, ions at rest."""
 
 _BLOCKS = 50  # of the sequence
