@@ -55,10 +55,10 @@ def position_covariances(
     -----
     The sum of four parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
     neighbours; the change by one standard error of each constant; what the recession is not sure about, see
-    `EvolvingReconstruction.recession_changes`, averaged over 24 ions of about the same direction at any time where the
-    flux at the rim was followed; and the local scatter, which comes from the emission and the lattice and is not seen in
-    any measurement. An ion whose place on the surface is wrong is moved along it:
-    far from the axis this changes its depth, too.
+    `EvolvingReconstruction.recession_changes`, averaged over 24 ions of about the same direction at any time if the
+    flux at the rim was followed; and the local scatter, which comes from the emission and the lattice and is not seen
+    in any measurement. An ion whose place on the surface is wrong is moved along it: far from the axis this changes its
+    depth, too.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
     if reconstruction.history is None:
