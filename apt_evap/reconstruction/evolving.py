@@ -235,6 +235,11 @@ class EvolvingReconstruction(Reconstruction):
         return self._followed[0].ions  # type: ignore[no-any-return]
 
     @property
+    def followed_by(self) -> str:
+        """What the recession of the last pass followed from: the "ring", or voltage and phases, "surface"."""
+        return self._followed[1].way  # type: ignore[no-any-return]
+
+    @property
     def found_features(self) -> list[tuple[PhaseField, Feature]]:
         """Each of `phases` whose contrast was seen, and its ions of `sequence`."""
         seen = [one for one in self.phases if not one.contrast < CONTRAST_GATE]
@@ -296,7 +301,7 @@ class EvolvingReconstruction(Reconstruction):
             return []
         ions = self.sequence
         usual = self.again(ions)
-        if self._followed[1].way == "ring":
+        if self.followed_by == "ring":
             return [self.again(ions, by="surface") - usual]
         errors = np.diag([one.error for one, _ in self.found_features])
         return [self.again(ions, voltage=1 + VOLTAGE_ERROR) - usual] + [

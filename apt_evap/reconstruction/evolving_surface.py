@@ -21,7 +21,7 @@ from apt_evap._core.surface_map import place_ions
 from apt_evap.reconstruction.spherical_harmonics import Coefficients, SphericalTransform
 
 _DEGREE = 44  # largest of the harmonics of the surface
-_CUTOFF = 16.0  # degree at which the volume of ions is damped to exp(-1/2)
+_CUTOFF = 24.0  # degree at which the volume of ions is damped to exp(-1/2)
 _RING = 0.82  # of the half angle of the field of view, from which the ring reaches to its rim
 _RING_MEMORY = 1 / 13  # of the radius: depth over which the flux of the ring is averaged, 1 nm of R = 13 nm
 _STEP = 1 / 130  # of the radius: largest depth of a step
@@ -31,6 +31,8 @@ _STIFFNESS = 0.03  # of the evaporation beyond the field of view: relative chang
 _LARGEST_EXPONENT = 1.2
 _FRAME_FROM, _FRAME_TO = math.radians(55.0), math.radians(72.0)  # ring whose mean height stays
 _SPHERE_FROM, _SPHERE_WIDTH = math.radians(75.0), math.radians(5.0)  # beyond, the surface is kept spherical
+_SHAPE_WINDOW = 1 / 87  # of the radius: standard deviation of the depths of a shape's average, that of the voltage
+_FIRST_AVERAGED = 8  # degree: lower ones remember more than the window, and a layer changes them as fast as it
 _SWEEPS = 8  # of the search for the origin of an ion
 _DAMPING = 0.65  # of the sweeps after the first: without it they diverge where the map is close to a fold
 
@@ -128,7 +130,8 @@ class SurfaceSteps(NamedTuple):
     fold: Floats
     """Largest reduction of area from the surface to the detector, shape (k,): the map folds at 1."""
     shapes: Coefficients
-    """Coefficients of the height above the sphere [nm] at the beginning of each step, shape (k, m, l)."""
+    """Coefficients of the height above the sphere [nm] at the beginning of each step, by the ions before and after it,
+    shape (k, m, l)."""
 
 
 class SurfacePass(NamedTuple):
@@ -159,6 +162,8 @@ class EvolvingSurface:
     :math:`g_l l(l+1) - 2` per R of depth, 3, 11 and 49 for l = 2, 4 and 10: forwards in time. Backwards it would grow.
 
     On a shank with w = dR/dz, R = R_0 + w z, and the sphere recedes by :math:`\cos\theta - w (1-\cos\theta)` per dz.
+
+    The shape at a time follows from the ions before it, the ions from the shapes before and after them (`settled`).
     """
 
     def __init__(self, ions: IonSequence) -> None:
@@ -218,7 +223,7 @@ class EvolvingSurface:
         edges = np.searchsorted(nominal, np.linspace(0, nominal[-1], steps + 1))
         edges[0], edges[-1] = 0, n
         ring = self._ring_flux(edges, nominal)
-        positions, at_ions, apex = np.empty((n, 3)), np.empty(n), np.empty(n)
+        apex = np.empty(n)
         kept = np.zeros((5, steps))
         shapes = np.empty((steps, degrees[-1] + 1, degrees[-1] + 1), np.complex128)
         height = np.zeros_like(shapes[0])
@@ -233,13 +238,11 @@ class EvolvingSurface:
             vectors = np.stack([-self._transfer * epsilon, epsilon])
             (heights, divergence, excess), (deflection, slope) = transform.fields_and_gradient(scalars, vectors)
             field_map = 1 + excess
-            directions, at_surface, counts = self.origins(
-                ions.directions[chosen], deflection, np.stack([heights, field_map])
-            )
+            _, at_surface, counts = self.origins(ions.directions[chosen], deflection, field_map[None])
             # 2. the recession of the sphere
             volume = ions.volume * (edges[k + 1] - edges[k])
             expected = volume / (ions.swept * radius**2)
-            mean = float(np.mean(voltages[chosen] * at_surface[:, 1] / fields[chosen])) if volume else 1.0
+            mean = float(np.mean(voltages[chosen] * at_surface[:, 0] / fields[chosen])) if volume else 1.0
             if recession != "ring":
                 control = float(np.clip(_GAIN * (1 - mean), -_LARGEST_EXPONENT, _LARGEST_EXPONENT))
             sunk = expected * (ring[k] if recession == "ring" else math.exp(control))
@@ -264,15 +267,12 @@ class EvolvingSurface:
             else:
                 even = even * sunk
             gone += np.where(beyond, even, 0.0)
-            # 4. the ions
             within = (np.arange(edges[k + 1] - edges[k]) + 0.5) / max(1, edges[k + 1] - edges[k]) * sunk
-            positions[chosen] = (radius + at_surface[:, :1] + (growth * within)[:, None]) * directions
-            positions[chosen, 2] -= (depth + within) * (1 + growth)
-            at_ions[chosen], apex[chosen] = at_surface[:, 1], depth + within
+            apex[chosen] = depth + within
             fold = float(-divergence[~beyond].min())
             kept[:, k] = nominal[edges[k]], depth, sunk / expected if expected else ring[k], mean, fold
             shapes[k] = height
-            # 5. the next shape
+            # 4. the next shape
             change = -gone / (radius + heights) ** 2 + sunk * self._sphere
             change -= sunk * (1 + growth) * (slope * self._axis).sum(axis=0)
             lowered, relaxed = transform.analysis(
@@ -281,8 +281,65 @@ class EvolvingSurface:
             height = height + self._damping * lowered - relaxed
             depth += sunk
         first, below, factors, means, folds = kept
-        record = SurfaceSteps(edges, first, below, factors, means, ring, folds, shapes)
-        return SurfacePass(positions, at_ions, apex, record)
+        record = SurfaceSteps(edges, first, below, factors, means, ring, folds, self.settled(shapes, below))
+        return self._place(apex, record)
+
+    def settled(self, shapes: Coefficients, depths: Floats) -> Coefficients:
+        """Shapes by the ions before and after each step: averaged over the depth, without the delay of the damping.
+
+        Parameters
+        ----------
+        shapes : ndarray
+            Coefficients that follow from the ions before each step, shape (k, m, l).
+        depths : ndarray
+            Depth of the apex at each step [nm], shape (k,).
+
+        Returns
+        -------
+        ndarray, shape (k, m, l)
+
+        Notes
+        -----
+        A degree whose volume is damped by D comes to rest at the rate D (g l (l+1) - 2) per R and is late by
+        (1 - D) / D of that of an undamped one. The noise of the ions in it lasts as long as the rate says, and is less
+        in a mean over the depth. Degrees 0 and 1, the frame of the sphere, stay.
+        """
+        steps = len(depths)
+        if steps < 2 or depths[-1] <= depths[0]:
+            return shapes
+        degrees = self.transform.degrees.astype(np.float64)
+        step = (depths[-1] - depths[0]) / (steps - 1)
+        rates = np.maximum(self._transfer * degrees * (degrees + 1) - 2, 1.0)
+        delays = self.ions.radius * (1 - self._damping) / (self._damping * rates) / step
+        delays[:2] = 0
+        parts = np.ascontiguousarray(shapes).view(np.float64).reshape(*shapes.shape, 2)
+        means = scipy.ndimage.gaussian_filter1d(parts, _SHAPE_WINDOW * self.ions.radius / step, axis=0, mode="nearest")
+        means[:, :, :_FIRST_AVERAGED] = parts[:, :, :_FIRST_AVERAGED]
+        at = np.minimum(np.arange(steps)[:, None] + delays, steps - 1)  # of each step and degree
+        before = np.minimum(at.astype(np.intp), steps - 2)
+        later = (at - before)[:, None, :, None]
+        numbers = np.arange(len(degrees))
+        first, second = (means[rows, :, numbers].transpose(0, 2, 1, 3) for rows in (before, before + 1))
+        found: Coefficients = np.ascontiguousarray((1 - later) * first + later * second).view(np.complex128)[..., 0]
+        return found
+
+    def _place(self, apex, steps):
+        """The ions on the shapes of their steps."""
+        ions, transform, growth = self.ions, self.transform, self.ions.growth
+        positions, at_ions = np.empty((len(apex), 3)), np.empty(len(apex))
+        for k, (depth, height) in enumerate(zip(steps.depths, steps.shapes, strict=True)):
+            chosen = slice(steps.first_ions[k], steps.first_ions[k + 1])
+            radius = ions.radius + growth * max(depth, 0.0)
+            epsilon = height / radius
+            (heights, excess), (deflection,) = transform.fields_and_gradient(
+                np.stack([height, (transform.degrees - 1) * epsilon]), -(self._transfer * epsilon)[None]
+            )
+            directions, values, _ = self.origins(ions.directions[chosen], deflection, np.stack([heights, 1 + excess]))
+            within = apex[chosen] - depth
+            positions[chosen] = (radius + values[:, :1] + (growth * within)[:, None]) * directions
+            positions[chosen, 2] -= (depth + within) * (1 + growth)
+            at_ions[chosen] = values[:, 1]
+        return SurfacePass(positions, at_ions, apex, steps)
 
     def at_directions(self, table: Floats, directions: Floats) -> Floats:
         """Values at directions, shape (n, j), of j fields, shape (j, polar angles, azimuths)."""

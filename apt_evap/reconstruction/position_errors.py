@@ -17,7 +17,7 @@ from apt_evap.reconstruction.evolving_surface import IonSequence
 
 CONSTANT_ERRORS: Mapping[str, float] = {"compression": 0.05, "radius": 0.05, "efficiency": 0.05}
 """Relative standard errors of the constants where none are given."""
-LOCAL_SCATTER = (0.18, 0.06)
+LOCAL_SCATTER = (0.174, 0.057)
 """Scatter of ions along the surface, in each of two directions, and across it [nm]: aluminium, 12 nm, ions at rest."""
 
 _BLOCKS = 50  # of the sequence
@@ -55,9 +55,10 @@ def position_covariances(
     -----
     The sum of four parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
     neighbours; the change by one standard error of each constant; what the recession is not sure about, see
-    `EvolvingReconstruction.recession_changes`; and the local scatter, which comes from the emission
-    and the lattice and is not seen in any measurement. An ion whose place on the surface is wrong is moved along it:
-    far from the axis this changes its depth, too.
+    `EvolvingReconstruction.recession_changes`, averaged over 24 ions of about the same direction at any time if the
+    flux at the rim was followed; and the local scatter, which comes from the emission and the lattice and is not seen
+    in any measurement. An ion whose place on the surface is wrong is moved along it: far from the axis this changes its
+    depth, too.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
     if reconstruction.history is None:
@@ -76,15 +77,17 @@ def position_covariances(
         corrections.append(moved[near].mean(axis=1))
     half = (corrections[0] - corrections[1]) / 2
     half -= half.mean(axis=0)
-    near = scipy.spatial.cKDTree(sphere).query(sphere, k=_NEAR)[1]
-    products = half[:, :, None] * half[:, None, :]
-    total += products[near].mean(axis=1)
-    changes = reconstruction.recession_changes()
-    changes += [
+    total += _mean_products(half, sphere)
+    changes = [
         reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual
         for name, error in errors.items()
         if error
     ]
+    if reconstruction.followed_by == "ring":  # a draw: where two measures agree by chance neither is sure
+        for change in reconstruction.recession_changes():
+            total += _mean_products(change - change.mean(axis=0), ions.directions)
+    else:
+        changes += reconstruction.recession_changes()
     for change in changes:
         change -= change.mean(axis=0)
         total += change[:, :, None] * change[:, None, :]
@@ -94,6 +97,12 @@ def position_covariances(
     places = reconstruction.positions
     stride = -(-len(places) // len(usual))
     return np.asarray(total[scipy.spatial.cKDTree(places[::stride]).query(places)[1]])
+
+
+def _mean_products(changes, places):
+    """Products of the components of changes, shape (n, 3, 3), means over ions at neighbouring places."""
+    near = scipy.spatial.cKDTree(places).query(places, k=_NEAR)[1]
+    return (changes[:, :, None] * changes[:, None, :])[near].mean(axis=1)
 
 
 def local_covariances(ions: IonSequence, local: Sequence[float]) -> Floats:

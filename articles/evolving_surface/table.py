@@ -25,7 +25,7 @@ import apt_evap as ae
 RADIUS, COMPRESSION = 12.963, 1.0342  # fitted to the sites of the pure run, R = 12 nm
 EFFICIENCY, HALF_ANGLE, DISTANCE = 0.5, 30.0, 100.0
 CONTRASTS = {"solute": 0.4, "20/2 %": 0.2, "6/2 %": 0.06}  # content of the phases, 2 % in the matrix
-CHOSEN_ON = ("pure_1", "sphere_low-rolled_1", "layer_high-rolled_1", "layer40_high_1")
+CHOSEN_ON = ("pure_1", "sphere_high_1", "layer_high_1")
 PHASE_FIELDS = {
     "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
     "sphere_edge": [0.85], "layer_high": [1.15],

@@ -86,6 +86,26 @@ def test_ions_of_an_even_flux_stay_on_the_sphere():
     np.testing.assert_allclose(found.steps.recession, 1.0, atol=0.03)
 
 
+def test_shapes_are_averaged_over_their_depths_and_are_not_late():
+    surface = surface_of(2000)
+    depths = np.linspace(0, 6, 601)
+    shapes = np.zeros((601, 45, 45), np.complex128)
+    # a degree that grows evenly is late by its damping, D = exp(-l^2 / 2 / 24^2), and the rate at which it is forgotten
+    damping = math.exp(-(20**2) / 2 / 24**2)
+    late = RADIUS * (1 - damping) / damping / (float(transfer(20)) * 420 - 2)
+    noise = np.random.default_rng(5).normal(size=601)
+    shapes[:, 3, 20], shapes[:, 0, 1], shapes[:, 0, 12] = 0.1j * (depths - late), noise, noise
+    found = surface.settled(shapes, depths)
+    middle = slice(80, 500)  # four standard deviations of 15 depths and the delay from the ends
+    np.testing.assert_allclose(found[middle, 3, 20], 0.1j * depths[middle], atol=1e-6)
+    assert late > 0.03
+    np.testing.assert_array_equal(found[:, 0, 1], noise)  # the frame
+    # a Gaussian of a width of w depths leaves 1 / sqrt(2 w sqrt(pi)) of the noise; 420 / 30 values are independent
+    left = 1 / math.sqrt(2 * RADIUS / 87 / 0.01 * math.sqrt(math.pi))
+    assert found[middle, 0, 12].real.std() == pytest.approx(left, rel=0.4)
+    np.testing.assert_array_equal(surface.settled(shapes[:1], depths[:1]), shapes[:1])
+
+
 def test_a_cone_widens_the_sphere_and_keeps_its_volume():
     growth = 0.1
     surface = surface_of(12_000, growth=growth)
