@@ -4,7 +4,7 @@ from apt_evap._core.index cimport Index
 
 cdef enum:
     ORDER = 6                                        # of the potential
-    SAMPLES = 24                                     # points at which the field is summed
+    SAMPLES = 20                                     # points at which the field is summed
     MONOMIALS = ORDER * (ORDER + 1) * (ORDER + 2) // 6   # of each component of the field, up to degree ORDER - 1
 
 

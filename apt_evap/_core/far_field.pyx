@@ -1,7 +1,7 @@
 """Expansion of the field of distant charges about a ball of targets.
 
 The potential of charges outside a ball is harmonic inside. Up to an order, the expansion in harmonic polynomials is
-fitted to the field at points on the surface of the ball (least squares, with a fixed matrix). It then replaces the sums
+fitted to the field at points on a sphere in the ball (least squares, with a fixed matrix). It then replaces the sums
 over the charges at any number of points inside: a local expansion as in fast multipole methods (Greengard and Rokhlin,
 J. Comput. Phys. 73, 325, 1987), but from sums of any kind of source. The error of a charge at the distance kappa radii
 from the centre decreases as kappa**-ORDER.
@@ -20,19 +20,27 @@ from apt_evap._core.index cimport Index
 
 cdef extern from "kernels.h":
     const int SINGLE_LANES
-    void add_polynomials(int, const float*, const float*, float, Index, const float*, float*) noexcept nogil
+    void add_polynomials(const float*, const float*, float, Index, const float*, float*) noexcept nogil
     void weighted_sum(Index, int, const double*, const double*, Index, double*) noexcept nogil
 
 N_SAMPLES, POTENTIAL_ORDER = SAMPLES, ORDER
 
+DEPTH = 0.8
+"""Radius of the sphere of the samples over that of the ball.
+
+The harmonics above the order disturb the fit less than at the rim of the ball. Measured (sheets of charges beyond 3.2
+radii, places along a tube, RMS errors): 24 samples at 1 / 0.9 / 0.8 have 1.64e-4 / 1.46e-4 / 1.37e-4, 20 samples
+2.2e-4 / 1.78e-4 / 1.56e-4, 18 samples 3.1e-4 / 2.4e-4 / 1.95e-4.
+"""
+
 
 def _directions():
-    """Points on the unit sphere along a spiral, shape (SAMPLES, 3)."""
+    """Points along a spiral on a sphere in the unit ball, shape (SAMPLES, 3)."""
     number = np.arange(SAMPLES) + 0.5
     z = 1.0 - 2.0 * number / SAMPLES
     sine, cosine = elementary.sine_and_cosine(np.pi * (1.0 + np.sqrt(5.0)) * number)
     radius = np.sqrt(1.0 - z * z)
-    return np.stack([radius * cosine, radius * sine, z], axis=1)
+    return DEPTH * np.stack([radius * cosine, radius * sine, z], axis=1)
 
 
 def exponents():
@@ -113,8 +121,7 @@ cdef void add_expanded(const Expansion* expansion, const double* origin, Index m
     cdef int axis
     for axis in range(3):
         centre[axis] = <float>(expansion.centre[axis] - origin[axis])
-    add_polynomials(ORDER - 1, expansion.coefficients, centre, <float>(1.0 / expansion.radius), m,
-                    targets, field)
+    add_polynomials(expansion.coefficients, centre, <float>(1.0 / expansion.radius), m, targets, field)
 
 
 cdef class FarField:

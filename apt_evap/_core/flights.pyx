@@ -75,11 +75,11 @@ cdef double SCOUT_TOLERANCE = 3e-2
 
 # The field of distant sources is expanded about one ball for each part of a step, or about one for the whole step if
 # the balls of the parts are not smaller than SPLIT of it. FAR is the distance in radii of a ball from which sources
-# are expanded. Measured on Ni[111], 240 ions after 4,000 events, 140 launches of an ion, 600 launches against direct
-# sums: at R = 40 a with 3 / 3.2 / 3.4, places deviate by 0.70 / 0.66 / 0.61 um (median) and 1.77 / 1.46 / 1.35 um
-# (95 %), with 620 / 710 / 815 thousand pairs an ion; expansions that are not nested, from 3 radii, by 0.66 and 1.71 um.
-# At R = 80 a with 3 / 3.2, by 0.52 / 0.52 and 1.16 / 1.10 um; expansions that are not nested by 0.56 and 1.13 um.
-cdef double FAR = 3.2
+# are expanded. Measured on Ni[111], R = 40 a, 240 ions after 4,000 events, 140 launches of an ion, 1,200 launches
+# against direct sums, with TOGETHER = 10: with 2.8 / 2.9 / 3, places deviate by 0.72 / 0.70 / 0.68 um (median) and
+# 1.71 / 1.64 / 1.55 um (95 %), with 479 / 524 / 569 thousand pairs an ion. With 3 / 3.2 and TOGETHER = 30, by 0.61 /
+# 0.57 and 1.48 / 1.43 um, with 574 / 663 thousand pairs.
+cdef double FAR = 3.0
 cdef double SPLIT = 0.9
 
 # A flight alone has one list of sources for several steps: at the start for a ball of AT_START lengths, later for the
@@ -100,6 +100,11 @@ cdef double LONE = 1.25
 cdef double[2] AROUND = [6.0, 2.0]
 cdef double LARGEST = 30.0
 cdef Index FEW = 8
+
+# Tolerance of a bundle, whose errors come from cells and expansions, over that of a flight alone. Measured at R = 40 a
+# (the ions of FAR): with 1 / 3 / 10 / 30, places deviate by 0.64 / 0.61 / 0.68 / 0.61 um (median), 1.55 / 1.42 / 1.55 /
+# 1.48 um (95 %) and 2.9 / 2.7 / 2.4 / 3.5 um (largest), in 925 / 871 / 830 / 822 us an ion.
+cdef double TOGETHER = 10.0
 
 cdef Index MOST_REFUSED = 12  # successive steps that hit an atom, each a tenth of the one before: it starts at one
 
@@ -432,6 +437,7 @@ cdef class Flights:
         cdef double* sums
         cdef double* origin
         cdef double time = 0.0, dt, largest, s, length, away
+        cdef double tolerance
         cdef Index i, k, n, flying = m, _, refused = 0
         cdef int stage, axis
         self.reserve(m)
@@ -452,6 +458,7 @@ cdef class Flights:
         self.gather(0.0)
         self.evaluate(x, a, 0)
         # a first step of an atomic distance at most, from the acceleration at the start
+        tolerance = self.tolerance * (TOGETHER if self.in_lanes else 1.0)
         dt = 1e30
         for k in range(m):
             s = length = 0.0
@@ -468,7 +475,7 @@ cdef class Flights:
                 stage_places(n, dt, NODE[stage], x, v, sums, trial)
                 self.evaluate(trial, a + n * stage, stage)
             # accept the step if the largest error is below the tolerance: v += dt sum_k b_k f_k
-            largest = self.step_error(dt)
+            largest = self.step_error(dt, tolerance)
             self.n_steps += 1
             if largest <= 1.0:
                 refused = 0
@@ -591,20 +598,20 @@ cdef class Flights:
             longest = max(longest, (sqrt(max(0.0, rv * rv + vv * (self.reach * self.reach - rr))) - rv) / vv)
         return 1.0001 * longest
 
-    cdef double step_error(self, double dt) noexcept nogil:
+    cdef double step_error(self, double dt, double tolerance) noexcept nogil:
         # Largest error of the step of all flights, relative to the tolerance.
         cdef Index n = 3 * self.width
         cdef double largest
         cdef double* speeds = self.spare + n
         weighted_sum(n, STAGES, POSITION_ERROR, self.a, n, self.sums)
-        relative_lengths(self.width, dt * dt / self.tolerance, 0.1 * self.length, self.sums, self.trial, self.origin,
+        relative_lengths(self.width, dt * dt / tolerance, 0.1 * self.length, self.sums, self.trial, self.origin,
                          self.ratios)
         largest = self.largest_ratio(0.0)
         # the acceleration at the end of the step is that of the last stage
         weighted_sum(n, STAGES, VELOCITY_ERROR, self.a, n, self.sums)
         weighted_sum(n, STAGES, ENDS, self.a, n, self.spare)
         stage_places(n, 0.5 * dt, 1.0, self.v, self.spare, self.none, speeds)
-        relative_lengths(self.width, dt / self.tolerance, 0.0, self.sums, speeds, self.none, self.ratios)
+        relative_lengths(self.width, dt / tolerance, 0.0, self.sums, speeds, self.none, self.ratios)
         return self.largest_ratio(largest)
 
     cdef double largest_ratio(self, double largest) noexcept nogil:

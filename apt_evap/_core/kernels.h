@@ -67,56 +67,43 @@
 #include "kernels_bundle.h"
 
 /* Adds three polynomials at m places, a multiple of SINGLE_LANES: targets and field contain x[m], y[m], z[m]. With
- * u = scale (x - centre), the polynomials are sums of coefficients of all u^i v^j w^k with i + j + k <= degree (k fastest),
- * for each component in turn. Horner's scheme in each variable. */
-APT_CLONES static void add_polynomials(int degree, const float *restrict coefficients, const float *restrict centre,
-                                       float scale, Index m, const float *restrict targets, float *restrict field)
+ * u = scale (x - centre), the polynomials are sums of coefficients of all u^i v^j w^k with i + j + k <= DEGREE (k fastest),
+ * for each component in turn. Horner's scheme in each variable; without loops that depend on i and j it takes 0.28 of
+ * the time, so the degree is fixed. */
+#define DEGREE 5
+APT_CLONES static void add_polynomials(const float *restrict coefficients, const float *restrict centre, float scale,
+                                       Index m, const float *restrict targets, float *restrict field)
 {
-    const Index stride = (Index)(degree + 1) * (degree + 2) * (degree + 3) / 6;
+    const int stride = (DEGREE + 1) * (DEGREE + 2) * (DEGREE + 3) / 6;
     for (Index first = 0; first < m; first += SINGLE_LANES) {
         float x[SINGLE_LANES], y[SINGLE_LANES], z[SINGLE_LANES];
-        float fx[SINGLE_LANES] = {0}, fy[SINGLE_LANES] = {0}, fz[SINGLE_LANES] = {0};
 #pragma omp simd
         for (int l = 0; l < SINGLE_LANES; l++) {
             x[l] = scale * (targets[first + l] - centre[0]);
             y[l] = scale * (targets[m + first + l] - centre[1]);
             z[l] = scale * (targets[2 * m + first + l] - centre[2]);
         }
-        Index at = stride;
-        for (int i = degree; i >= 0; i--) {
-            float gx[SINGLE_LANES] = {0}, gy[SINGLE_LANES] = {0}, gz[SINGLE_LANES] = {0};
-            for (int j = degree - i; j >= 0; j--) {
-                float hx[SINGLE_LANES] = {0}, hy[SINGLE_LANES] = {0}, hz[SINGLE_LANES] = {0};
-                for (int k = degree - i - j; k >= 0; k--) {
-                    at--;
-                    const float cx = coefficients[at], cy = coefficients[stride + at];
-                    const float cz = coefficients[2 * stride + at];
-#pragma omp simd
-                    for (int l = 0; l < SINGLE_LANES; l++) {
-                        hx[l] = hx[l] * z[l] + cx;
-                        hy[l] = hy[l] * z[l] + cy;
-                        hz[l] = hz[l] * z[l] + cz;
-                    }
-                }
-#pragma omp simd
-                for (int l = 0; l < SINGLE_LANES; l++) {
-                    gx[l] = gx[l] * y[l] + hx[l];
-                    gy[l] = gy[l] * y[l] + hy[l];
-                    gz[l] = gz[l] * y[l] + hz[l];
-                }
-            }
+        for (int axis = 0; axis < 3; axis++) {
+            const float *restrict component = coefficients + axis * stride;
 #pragma omp simd
             for (int l = 0; l < SINGLE_LANES; l++) {
-                fx[l] = fx[l] * x[l] + gx[l];
-                fy[l] = fy[l] * x[l] + gy[l];
-                fz[l] = fz[l] * x[l] + gz[l];
+                float f = 0.0f;
+                int at = stride;
+#pragma GCC unroll 6
+                for (int i = DEGREE; i >= 0; i--) {
+                    float g = 0.0f;
+#pragma GCC unroll 6
+                    for (int j = DEGREE - i; j >= 0; j--) {
+                        float h = component[--at];
+#pragma GCC unroll 6
+                        for (int k = DEGREE - i - j; k > 0; k--)
+                            h = h * z[l] + component[--at];
+                        g = g * y[l] + h;
+                    }
+                    f = f * x[l] + g;
+                }
+                field[axis * m + first + l] += f;
             }
-        }
-#pragma omp simd
-        for (int l = 0; l < SINGLE_LANES; l++) {
-            field[first + l] += fx[l];
-            field[m + first + l] += fy[l];
-            field[2 * m + first + l] += fz[l];
         }
     }
 }

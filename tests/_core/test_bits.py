@@ -55,7 +55,7 @@ int main(void)
     enclosing_ball(101, x, y, z, 0.1, 0.3, step + 101);
     relative_lengths(101, 0.3, 0.1, x, y, z, step + 105);
     into_lanes(101, x, origin, lanes), out_of_lanes(96, 0.3, lanes, step + 206);
-    add_polynomials(5, columns, targets, 0.3, GROUP, targets, bundle);
+    add_polynomials(columns, targets, 0.3, GROUP, targets, bundle);
     group_charges_single(N, list, cells, q, origin, targets, sums);
     group_charges_double(N, list, cells, q, origin, wide, wide_sums);
     patch_column(N, fx, fy, fz, fy, fz, fx, 5, 5, 5, 0.1, row, cubes);

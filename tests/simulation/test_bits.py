@@ -14,7 +14,7 @@ import pytest
 import apt_evap as ae
 from apt_evap.simulation.config.simulation_file import read_config
 
-FINGERPRINT = "f605bfd82eebaafafc81908b785b4b79594f63e451b7277251617842a30648d3"
+FINGERPRINT = "8ac7da36b7295f3a877443fb7d7562ad3001102023c722c2de1eaf991997334c"
 PROGRAM = """
 import warnings
 
