@@ -86,7 +86,7 @@ def test_a_pipe_is_no_registration_and_no_study(folder, capsys):
     assert "Not a regular file" in failed(capsys, "run.h5", "map.npz", "-o", "study", *QUICK, *HERE)
 
 
-def test_everything_is_written(folder, capsys):
+def test_everything_is_written(folder, capsys, rough_layout):
     assert main(["compare", "run.h5", "map.npz", "-o", "study", *QUICK, *HERE]) == 0
     out, _ = capsys.readouterr()
     first, *_, last = out.splitlines()
