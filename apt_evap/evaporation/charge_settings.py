@@ -41,7 +41,8 @@ class ChargeSettings:
         unit="d_nn",
     )
     sweep_interval: int | None = count(
-        "Events between two relaxations. By default 1/300 of the initial number of surface atoms, but at least 100.",
+        "Events between two relaxations. By default the initial number of surface atoms over that of the rule "
+        "(`RELAXATION_SHARE` of `Robin` or `ConstantPotential`, 300 or 200), but at least 100.",
         default=None,
         at_least=1,
     )
@@ -64,10 +65,11 @@ class ChargeSettings:
         at_most=1.5,
         unit="rad",
     )
-    whole_interval: int = count(
+    whole_interval: int | None = count(
         "Relaxations until the whole surface is relaxed. The others solve the atoms within `update_radius` of a hole "
-        "since the last one.",
-        default=10,
+        "since the last one. By default that of the rule (`WHOLE_INTERVAL` of `Robin` or `ConstantPotential`: 10 or "
+        "7).",
+        default=None,
         at_least=1,
     )
     potential_bound: float = number(

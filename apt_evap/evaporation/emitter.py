@@ -157,8 +157,11 @@ class Emitter:
         warn_if_not_for(type(self.rule).__name__, self.law)
         settings = ChargeSettings() if settings is None else settings
         check_kind(settings, "settings", ChargeSettings, "ChargeSettings")
+        tolerance, share, whole_interval = rules.relaxations_of(self.rule)
         if settings.tolerance is None:
-            settings = replace(settings, tolerance=rules.relaxation_tolerance_of(self.rule))
+            settings = replace(settings, tolerance=tolerance)
+        if settings.whole_interval is None:
+            settings = replace(settings, whole_interval=whole_interval)
         self.settings = settings
         self.n_threads = thread_count(n_threads)
         if control is not None:
@@ -194,7 +197,7 @@ class Emitter:
             raise ValueError(
                 f"law {type(self.law).__name__} gives no surface atom of {tip!r} a key > 0: no atom can evaporate"
             )
-        self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // 300)
+        self.sweep_interval = self.settings.sweep_interval or max(100, len(self) // share)
 
     @property
     def control(self) -> VoltageControl | None:
@@ -395,7 +398,8 @@ class Emitter:
         """
         core, settings = self._core, self.settings
         tolerance = check_number(settings.tolerance, "tolerance", above=0, at_most=1)
-        if core.whole_is_due or core.n_partial + 1 >= settings.whole_interval or tolerance < _SINGLE:
+        whole_interval = check_count(settings.whole_interval, "whole_interval", at_least=1)
+        if core.whole_is_due or core.n_partial + 1 >= whole_interval or tolerance < _SINGLE:
             return self.relax()
         outcome = core.relax_disturbed(tolerance=tolerance, n_threads=usable_threads(self.n_threads))
         return self.relax() if core.whole_is_due else self._converged(outcome, tolerance)

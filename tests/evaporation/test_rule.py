@@ -236,8 +236,17 @@ def test_bad_parameters_of_the_constant_potential_are_refused(bad, message):
         ae.ConstantPotential(**bad)
 
 
-def test_the_tolerance_of_relaxations_is_that_of_the_rule(tip12):
-    for rule, expected in ((None, 6e-3), (ae.Robin(), 6e-3), (ae.ConstantPotential(), 8e-3)):
-        assert ae.evaporation.Emitter(tip12, rule=rule).settings.tolerance == expected
-    given = ae.evaporation.ChargeSettings(tolerance=1e-3)
-    assert ae.evaporation.Emitter(tip12, rule=ae.ConstantPotential(), settings=given).settings == given
+class Coarse(ae.ConstantPotential):
+    RELAXATION_TOLERANCE, RELAXATION_SHARE, WHOLE_INTERVAL = 0.1, 20, 3
+
+
+def test_relaxations_are_those_of_the_rule(tip12):
+    robin, constant, coarse = (6e-3, 300, 10), (6e-3, 200, 7), (0.1, 20, 3)
+    rules = {None: robin, ae.Robin(): robin, ae.ConstantPotential(): constant, Coarse(): coarse}
+    for rule, expected in rules.items():
+        emitter = ae.evaporation.Emitter(tip12, rule=rule)
+        assert (emitter.settings.tolerance, emitter.settings.whole_interval) == expected[::2]
+        assert emitter.sweep_interval == max(100, len(emitter) // expected[1])
+    given = ae.evaporation.ChargeSettings(tolerance=1e-3, sweep_interval=150, whole_interval=2)
+    emitter = ae.evaporation.Emitter(tip12, rule=ae.ConstantPotential(), settings=given)
+    assert emitter.settings == given and emitter.sweep_interval == 150
