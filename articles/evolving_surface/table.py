@@ -298,7 +298,7 @@ def main():
         table += ["   * - " + "\n     - ".join(row) for row in rows]
         (options.output / name).write_text("\n".join(table) + "\n")
     if not options.only:
-        chosen = [path for path in paths if path.stem.startswith(("sphere_low-r", "layer_high-r", "layer40_high"))]
+        chosen = [path for path in paths if path.stem in ("layer_high_1", "sphere_low_1")]
         draw(chosen, options.output)
 
 
