@@ -57,9 +57,9 @@ lim [2 sqrt(pi N) - sum_{j<N} sqrt(s)/r_j] (Bonsall and Maradudin, Phys. Rev. B 
 ROUGH_ANGLE = 1.5
 """Opening angle of the potentials of a change of the charges [rad], unless that of the surface is larger.
 
-Measured (88,800 atoms) with 1.2: potentials of random changes have an error of 3.7e-3, of smooth ones 3.7e-4, and take
-0.37 of the time of those with 0.6. With 1.5 charges have the errors of 1.2 to three digits (Ni[111], R = 24 a); with 2.5
-solutions to 1e-5 do not converge.
+Measured (88,800 atoms) with 1.2: potentials of random changes have an error of 3.7e-3, of smooth ones 3.7e-4, and
+take 0.37 of the time of those with 0.6. With 1.5 charges have the errors of 1.2 to three digits (Ni[111], R = 24 a);
+with 2.5 solutions to 1e-5 do not converge.
 """
 
 ROUGH_ERROR = 0.01

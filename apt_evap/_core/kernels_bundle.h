@@ -92,17 +92,6 @@ APT_CLONES static void weighted_sum(Index n, int n_rows, const double *restrict 
         }
         memcpy(sums + first, sum, sizeof sum);
     }
-    for (; first + LANES <= n; first += LANES) {
-        double sum[LANES] = {0};
-        for (int k = 0; k < n_rows; k++) {
-            const double *restrict row = rows + k * stride + first;
-            const double weight = weights[k];
-#pragma omp simd
-            for (int j = 0; j < LANES; j++)
-                sum[j] += weight * row[j];
-        }
-        memcpy(sums + first, sum, sizeof sum);
-    }
     for (; first < n; first++) {
         double sum = 0.0;
         for (int k = 0; k < n_rows; k++)

@@ -349,12 +349,9 @@ cdef class Octree:
                     rest.n += 1
                     node = self.skip[node]
                 elif apart * apart < s and not self.cancels[node]:
-                    # a centre of charge lies in the ball of its node
-                    if s <= (beyond + radius) * (beyond + radius):
-                        dx, dy = ball[0] - self.cells[node, 0], ball[1] - self.cells[node, 1]
-                        dz = ball[2] - self.cells[node, 2]
-                        s = dx * dx + dy * dy + dz * dz
-                    if s > beyond * beyond:
+                    dx, dy = ball[0] - self.cells[node, 0], ball[1] - self.cells[node, 1]
+                    dz = ball[2] - self.cells[node, 2]
+                    if dx * dx + dy * dy + dz * dz > beyond * beyond:
                         sources.cell[sources.n_cells] = <int>node
                         sources.n_cells += 1
                     else:

@@ -59,7 +59,11 @@ class FlightSettings:
         unit="rad",
     )
     tolerance: float = number(
-        "Error of a step relative to path and velocity; 1e-3 moves hits by 0.1 um.", default=1e-3, above=0, at_most=0.1
+        "Error of a step relative to path and velocity, ten times as large for the launches of an ion together; 1e-3 "
+        "moves hits by 0.1 um.",
+        default=1e-3,
+        above=0,
+        at_most=0.1,
     )
     reach: float = number(
         "Distance from the apex at which the integration ends and the ion continues in a straight line; 11,314 is "
