@@ -1,7 +1,10 @@
 """Blind twins: maps of tips in random orientations, indexed without their truth.
 
     python twins.py RUNS simulate Pt Ta     # runs of some tips, all by default: half an hour of one core
-    python twins.py RUNS index Pt Ta        # eight maps of each, 10 to 26 s a map; --wrong: as another structure
+    python twins.py RUNS index Pt Ta        # eight maps of each; --wrong: as another structure
+    python twins.py RUNS index Pt --draw 1 --maps 4 --ions 20000    # other maps, of 20,000 ions or more
+    python twins.py RUNS bicrystals Pt --maps 2                     # two grains in a map, the second 5 to 50 % of it
+    python twins.py RUNS structureless --maps 20                    # rings, gradients, stripes, spots
 
 The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
 symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
@@ -13,9 +16,11 @@ them, a centre up to 0.08 radii off, an efficiency that changes by up to 30 % to
 import argparse
 import math
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import scipy
 from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
@@ -32,8 +37,14 @@ TIPS = {  # radius [a], charging rule, events before the first ion, ions, seed o
     "Ge": (22, "Robin", 5_000, 14_000, 67),
     "Si": (60, "constant", 20_000, 20_000, 68),
     "Cu": (40, "constant", 6_000, 80_000, 69),
+    "Al": (40, "constant", 6_000, 18_000, 71),
+    "W": (40, "Robin", 6_000, 18_000, 72),
+    "Au": (30, "Robin", 4_000, 16_000, 73),
+    "Nb": (50, "constant", 9_000, 18_000, 74),
+    "Ir": (28, "constant", 3_000, 14_000, 75),
+    "V": (36, "Robin", 5_000, 16_000, 76),
+    "Pd": (70, "Robin", 12_000, 20_000, 77),
 }
-MAPS = 8
 WRONG = {"fcc": "W", "bcc": "Ni", "diamond": "Ni"}
 EMISSIONS = (
     ae.Unperturbed(),
@@ -76,8 +87,11 @@ class Crystal:
         projection = ae.analysis.image_compression(run).projection
         self.ions = [_flattened(projection, real.hits(emission), self.orientation.matrix) for emission in EMISSIONS]
 
-    def map(self, seed):
-        """A map, its projection, the rotation from crystal to specimen, and what it is."""
+    def map(self, seed, least=4_000, second=0.0):
+        """A map, its projection, the rotation from crystal to specimen, and what it is.
+
+        `least` is its smallest number of ions, `second` the part of its disc that another grain takes.
+        """
         random = np.random.default_rng(seed)
         turn = Rotation.random(random_state=int(random.integers(1 << 31))).as_matrix()
         half_angle, scale = math.radians(random.uniform(15, 40)), random.uniform(20, 90)
@@ -86,6 +100,31 @@ class Crystal:
         projection = ae.detection.Projection(scale, compression=float(random.choice([1.5, 2.0, 4.0])))
         centre = random.uniform(-0.08, 0.08, 2) * half_angle * scale
         share = random.uniform(0.2, 0.8, len(kinds)) if len(kinds) > 1 else np.ones(1)
+        radius = half_angle * scale
+        places = self.places(random, turn, kinds, share, projection, half_angle)
+        if second:
+            other = Rotation.random(random_state=int(random.integers(1 << 31))).as_matrix()
+            others = self.places(random, other, kinds, share, projection, half_angle)
+            angle, boundary = random.uniform(0, 2 * math.pi), radius * segment(second)
+            normal = np.array((math.cos(angle), math.sin(angle)))
+            within, beyond = (
+                part[((part - centre) @ normal > boundary) == wanted]
+                for part, wanted in ((places, False), (others, True))
+            )
+            places = np.concatenate([within, beyond])
+        places = places[np.hypot(*(places - centre).T) < radius]
+        efficiency = 1 + (places - centre) / radius @ random.uniform(-0.3, 0.3, 2)
+        places = places[random.random(len(places)) < efficiency / 1.5]
+        n = int(min(len(places), math.exp(random.uniform(math.log(least), math.log(300_000)))))
+        background = int(random.uniform(0, 0.12) * n)
+        distance, angle = radius * np.sqrt(random.random(background)), random.uniform(0, 2 * math.pi, background)
+        noise = centre + np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
+        places = np.concatenate([places[random.permutation(len(places))[: n - background]], noise])
+        detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
+        return detector_map, projection, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees"
+
+    def places(self, random, turn, kinds, share, projection, half_angle):
+        """Places of the ions of a crystal with a rotation, with the same density in all directions."""
         parts = []
         for (directions, acceptance), part in zip((self.ions[k] for k in kinds), share, strict=True):
             parts.append(directions[random.random(len(directions)) < part * acceptance])
@@ -96,20 +135,9 @@ class Crystal:
         axis = self.orientation.matrix[2]
         covered = sum((crystal @ member @ axis > math.cos(CONE)).astype(int) for member in self.group)
         chance = np.minimum(1, np.quantile(covered, 0.2) / np.maximum(covered, 1))
-        places = projection.places(crystal[random.random(len(crystal)) < chance] @ turn.T)
-        radius = half_angle * scale
-        places = places[np.hypot(*(places - centre).T) < radius]
-        efficiency = 1 + (places - centre) / radius @ random.uniform(-0.3, 0.3, 2)
-        places = places[random.random(len(places)) < efficiency / 1.5]
-        n = int(min(len(places), math.exp(random.uniform(math.log(4_000), math.log(300_000)))))
-        background = int(random.uniform(0, 0.12) * n)
-        distance, angle = radius * np.sqrt(random.random(background)), random.uniform(0, 2 * math.pi, background)
-        noise = centre + np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
-        places = np.concatenate([places[random.permutation(len(places))[: n - background]], noise])
-        detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
-        return detector_map, projection, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees"
+        return projection.places(crystal[random.random(len(crystal)) < chance] @ turn.T)
 
-    def error(self, detector_map, candidate, projection, turn):
+    def error(self, detector_map, candidate, *, projection, turn):
         """Median angle of true and found directions in the inner half [degrees], for the best equal crystal."""
         disc = disc_of(detector_map)
         grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 5)]), -1).reshape(-1, 2) * disc.radius + disc.centre
@@ -132,16 +160,69 @@ def _flattened(projection, hits, matrix):
     return directions @ matrix, np.minimum(1, np.quantile(smooth, 0.3) / smooth)
 
 
+def segment(part):
+    """Distance of a chord from the centre of a circle of radius 1 that cuts off a part of it."""
+    return scipy.optimize.brentq(lambda d: math.acos(d) - d * math.sqrt(1 - d * d) - math.pi * part, -1, 1)
+
+
+def structureless(number, least):
+    """A map of a disc without a crystal: rings, a gradient, stripes, or spots of hot pixels; and its name."""
+    random = np.random.default_rng(9_000 + number)
+    what = ("rings", "gradient", "stripes", "spots")[number % 4]
+    n = int(math.exp(random.uniform(math.log(least), math.log(300_000))))
+    angle, waves, depth = random.uniform(0, 2 * math.pi), random.uniform(1, 8), random.uniform(0.2, 0.9)
+    places = random.uniform(-1, 1, (8 * n, 2))
+    radius, across = np.hypot(*places.T), places @ (math.cos(angle), math.sin(angle))
+    density = {
+        "rings": 1 + depth * np.cos(2 * math.pi * waves * radius),
+        "gradient": 1 + depth * (across + 0.5 * np.cos(3 * across)),
+        "stripes": 1 + depth * np.cos(2 * math.pi * waves * across),
+        "spots": np.ones(len(places)),
+    }[what]
+    places = places[(radius < 1) & (random.random(len(places)) * 2.5 < density)][:n]
+    if what == "spots":
+        centres = random.uniform(-0.6, 0.6, (int(random.integers(1, 5)), 2))
+        hot = centres[random.integers(len(centres), size=n // 50)] + random.normal(0, 0.004, (n // 50, 2))
+        places = np.concatenate([places, hot])
+    places *= random.uniform(15, 45)
+    return ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128), what
+
+
+def indexed(name, detector_map, material, what, errors_of=None):
+    """Index a map and print the result, with the errors of its candidates."""
+    start = time.process_time()
+    try:
+        result = ae.index(detector_map, material)
+    except ValueError as error:  # a field of view with holes
+        print(f"{name}: refused, {error}", flush=True)
+        return
+    seconds = time.process_time() - start
+    errors = [errors_of(item) for item in result.candidates] if errors_of else []
+    off = f" off {errors[0]:5.1f}, best candidate {min(errors):5.1f}," if errors else ""
+    ions = f"{detector_map.ions:7,} ions"
+    print(f"{name}: {ions}, {what}: {result.verdict:9}{off} {seconds:4.1f} s; {result.reason}", flush=True)
+
+
 def main():
     """Simulate, or index."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder of the runs")
-    parser.add_argument("what", choices=("simulate", "index"))
+    parser.add_argument("what", choices=("simulate", "index", "bicrystals", "structureless"))
     parser.add_argument("elements", nargs="*", metavar="ELEMENT", help=", ".join(TIPS))
     parser.add_argument("--wrong", action="store_true", help="index as another crystal structure")
+    parser.add_argument("--maps", type=int, default=8, help="maps of each tip, or without structure")
+    parser.add_argument("--ions", type=int, default=4_000, help="fewest ions of a map")
+    parser.add_argument("--draw", type=int, default=0, help="other maps of the same tips")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
-    for element in options.elements or TIPS:
+    elements = options.elements or list(TIPS)
+    if options.what == "structureless":
+        for number in range(options.maps):
+            detector_map, what = structureless(number + 100 * options.draw, options.ions)
+            element = elements[number % len(elements)]
+            indexed(f"{number} as {element}", detector_map, element, what)
+        return
+    for element in elements:
         path = options.runs / f"{element}_{TIPS[element][0]}.h5"
         if options.what == "simulate":
             if not path.exists():
@@ -149,20 +230,18 @@ def main():
             continue
         crystal = Crystal(ae.load(path))
         material = crystal.orientation.material
-        for number in range(MAPS):
-            detector_map, projection, turn, what = crystal.map(100 * TIPS[element][4] + number)
-            start = time.process_time()
-            try:
-                result = ae.index(detector_map, WRONG[material.structure] if options.wrong else material)
-            except ValueError as error:  # a field of view with holes
-                print(f"{element} {TIPS[element][0]} a, map {number}: refused, {error}", flush=True)
-                continue
-            seconds = time.process_time() - start
-            errors = [crystal.error(detector_map, item, projection, turn) for item in result.candidates]
-            print(
-                f"{element} {TIPS[element][0]} a, map {number}: {detector_map.ions:7,} ions, {what}: {result.verdict:9}"
-                f" off {errors[0]:5.1f}, best candidate {min(errors):5.1f}, {seconds:4.1f} s; {result.reason}",
-                flush=True,
+        for number in range(options.maps):
+            seed, second = 10_000 * options.draw + 100 * TIPS[element][4] + number, 0.0
+            if options.what == "bicrystals":
+                seed, second = seed + 50, float(np.random.default_rng(seed + 50).uniform(0.05, 0.5))
+            detector_map, projection, turn, what = crystal.map(seed, options.ions, second)
+            what += f", second grain {second:.2f}" if second else ""
+            indexed(
+                f"{element} {TIPS[element][0]} a, map {number}",
+                detector_map,
+                WRONG[material.structure] if options.wrong else material,
+                what,
+                partial(crystal.error, detector_map, projection=projection, turn=turn),
             )
 
 
