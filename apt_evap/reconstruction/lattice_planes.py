@@ -67,8 +67,8 @@ class LatticePlanes:
         return math.degrees(math.acos(min(1.0, float(self.normal[2]))))
 
     def __str__(self) -> str:
-        chance = f"amplitude {self.amplitude:.3f}; 1 of {len(self.by_chance) + 1} specimens without planes has more than"
-        chance += f" {self.by_chance.max():.3f}"
+        without = f"1 of {len(self.by_chance) + 1} specimens without planes has more than {self.by_chance.max():.3f}"
+        chance = f"amplitude {self.amplitude:.3f}; {without}"
         ions = f"of {self.distances.references:,} ions"
         if not self.found:
             return f"no planes: {chance}, {ions}"

@@ -19,8 +19,8 @@ _COEFFICIENTS, _BYTES_PER_COEFFICIENT = 102, 24
 # of view, rates at 50 K) every second one was used for the fit: estimates over processor times are 0.81 to 1.25. Those
 # of the other 24 are 0.85 to 1.13, but for 0.69 (R = 100 a at a constant potential) and three of 1.24 to 1.36 (R = 12 a
 # with 30 launches, R = 40 a with one flight, half of the ions outside the field of view). AMD EPYC, while other
-# programs ran. Flights of responses have become faster since, to 0.65, 0.71 and 0.74 of the time at R = 20, 40 and 80 a:
-# their numbers are 0.7 of those of the fit.
+# programs ran. Flights of responses have become faster since, to 0.65, 0.71 and 0.74 of the time at R = 20, 40 and
+# 80 a: their numbers are 0.7 of those of the fit.
 _REFERENCE = 21_591  # surface atoms
 _EVENT, _RESPONSES, _LAUNCH, _EMISSION, _GROWTH = 0.34, 0.19, 0.0016, 0.033, 0.087
 # Seconds per atom in memory until the first ion: 1.6 to 3.4 us in the same 25 runs, 0.95 with silicon; 1.3 to 3.0 us in
