@@ -243,7 +243,11 @@ def draw(paths, output):
     figure = ae.plot.new_figure((13.0, 3.3 * len(paths)))
     figure.set_layout_engine("constrained")
     panels = figure.subplots(len(paths), 4, squeeze=False)
+    for ax in panels[:, :3].ravel()[1:]:
+        ax.sharex(panels[0, 0])
+        ax.sharey(panels[0, 0])
     for axes, path in zip(panels, paths, strict=True):
+        name = path.stem.rpartition("_")[0]
         hits, sites, phase = detected(path)
         found = reconstructed(hits, radius=RADIUS, shape="evolving", labels=phase)
         cap = reconstructed(hits, radius=RADIUS)
@@ -261,9 +265,10 @@ def draw(paths, output):
         axes[3].plot(history.depths, history.recession, label="recession / cap")
         axes[3].plot(history.depths, history.voltage, label="voltage, measured")
         axes[3].plot(history.depths, history.model_voltage, label="voltage, model")
-        axes[3].set(xlabel="depth of the apex [nm]", ylim=(0.3, 2.0))
+        axes[3].set(xlabel="depth of the apex [nm]", ylim=(0.3, 2.2))
         axes[3].legend(fontsize="small")
-        axes[0].set_title(f"{path.stem}: true sites")
+        (ratio,) = PHASE_FIELDS[name]
+        axes[0].set_title(f"true sites, {name.split('_')[0]} of {ratio:g} times the field")
     figure.savefig(output / "sections.png", dpi=110)
 
 
