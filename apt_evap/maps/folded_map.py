@@ -163,7 +163,7 @@ def folded(
     >>> maps = [run.hits(emission).map(bins=60) for emission in (ae.Unperturbed(), ae.RollUp(0.2))]
     >>> first, second = (ae.maps.folded(detector_map, projection, *pole, reach=30) for detector_map in maps)
     >>> print(first)
-    <FoldedMap of 364 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.81>
+    <FoldedMap of 364 ions: 2mm, up to 30 degrees, ceiling of a correlation 0.86>
     >>> print(f"{first.correlation(second):.2f}")
     0.20
     """
