@@ -254,9 +254,9 @@ def hash_of_figure(figure):
         parts.append(type(artist).__name__.encode())
         for name in DRAWN:
             value = getattr(artist, name, tuple)()
-            for each in value if isinstance(value, list) else [value]:
-                each = np.asarray(getattr(each, "vertices", each))
-                parts.append(repr(each.tolist()).encode() if each.dtype == object else each.tobytes())
+            for item in value if isinstance(value, list) else [value]:
+                array = np.asarray(getattr(item, "vertices", item))
+                parts.append(repr(array.tolist()).encode() if array.dtype == object else array.tobytes())
     return hash_of(*parts)
 
 

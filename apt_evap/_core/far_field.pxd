@@ -3,7 +3,7 @@
 from apt_evap._core.index cimport Index
 
 cdef enum:
-    ORDER = 6                                        # of the potential
+    ORDER = 6                                        # of the potential; add_polynomials has the degree 5
     SAMPLES = 20                                     # points at which the field is summed
     MONOMIALS = ORDER * (ORDER + 1) * (ORDER + 2) // 6   # of each component of the field, up to degree ORDER - 1
 

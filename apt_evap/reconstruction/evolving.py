@@ -21,7 +21,7 @@ from apt_evap._common.validation import check_array, check_number, check_sequenc
 from apt_evap.detection.hits import Hits
 from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
-from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence, SurfacePass
+from apt_evap.reconstruction.evolving_surface import DEPTH_WINDOW, EvolvingSurface, IonSequence, SurfacePass
 from apt_evap.reconstruction.found_region import found_tip
 from apt_evap.reconstruction.local_composition import (
     CONTRAST_GATE,
@@ -59,7 +59,6 @@ _WINDOW = 0.65  # of the radius: depth in which the trend is a straight line
 _FIRST_SHAPE = 0.065  # of the radius
 _PASSES = 7  # with voltage and phases after the first: fields change by less than 0.005 in the last
 _ION_LIMIT = 60_000  # in these passes; of more ions, every n-th
-_SMOOTHING = 1 / 87  # of the radius: depth over which the voltage is averaged, 0.15 nm of R = 13 nm
 _SPIN_UP = 0.05  # of the ions, from which nothing is measured: the first shape is not known
 _CLEAN = 0.02  # of the ions of a block: largest share of phases in a stretch of matrix
 _CLEAN_BLOCKS = 100
@@ -533,7 +532,7 @@ def _relative_voltages(hits, cap):
     if total.min() <= 0:
         row = int(total.argmin())
         raise ValueError(f'voltage must be > 0 V with shape="evolving", got {total[row]:g} V at ion {row}')
-    width = _SMOOTHING * float(np.median(cap.radii)) / max(float(np.ptp(cap.depths)), 1e-9) * len(total)
+    width = DEPTH_WINDOW * float(np.median(cap.radii)) / max(float(np.ptp(cap.depths)), 1e-9) * len(total)
     factors, jumps = without_jumps(total, width)
     smooth = smoothed(total * factors, width)
     return smooth / smooth.mean(), factors, jumps, ""

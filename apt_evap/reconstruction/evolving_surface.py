@@ -31,7 +31,8 @@ _STIFFNESS = 0.03  # of the evaporation beyond the field of view: relative chang
 _LARGEST_EXPONENT = 1.2
 _FRAME_FROM, _FRAME_TO = math.radians(55.0), math.radians(72.0)  # ring whose mean height stays
 _SPHERE_FROM, _SPHERE_WIDTH = math.radians(75.0), math.radians(5.0)  # beyond, the surface is kept spherical
-_SHAPE_WINDOW = 1 / 87  # of the radius: standard deviation of the depths of a shape's average, that of the voltage
+DEPTH_WINDOW = 1 / 87
+"""Part of the radius: depth over which shapes and voltages are averaged, 0.15 nm of R = 13 nm."""
 _FIRST_AVERAGED = 8  # degree: lower ones remember more than the window, and a layer changes them as fast as it
 _SWEEPS = 8  # of the search for the origin of an ion
 _DAMPING = 0.65  # of the sweeps after the first: without it they diverge where the map is close to a fold
@@ -313,7 +314,7 @@ class EvolvingSurface:
         delays = self.ions.radius * (1 - self._damping) / (self._damping * rates) / step
         delays[:2] = 0
         parts = np.ascontiguousarray(shapes).view(np.float64).reshape(*shapes.shape, 2)
-        means = scipy.ndimage.gaussian_filter1d(parts, _SHAPE_WINDOW * self.ions.radius / step, axis=0, mode="nearest")
+        means = scipy.ndimage.gaussian_filter1d(parts, DEPTH_WINDOW * self.ions.radius / step, axis=0, mode="nearest")
         means[:, :, :_FIRST_AVERAGED] = parts[:, :, :_FIRST_AVERAGED]
         at = np.minimum(np.arange(steps)[:, None] + delays, steps - 1)  # of each step and degree
         before = np.minimum(at.astype(np.intp), steps - 2)

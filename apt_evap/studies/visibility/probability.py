@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -106,12 +107,12 @@ class Visibility:
         p = (np.count_nonzero(self.p_values <= self.significance) + 1) / (n + 2)
         return Estimated(float(p), math.sqrt(p * (1 - p) / (n + 3)))
 
-    @property
+    @cached_property
     def n50(self) -> Estimated:
         """Recorded ions of the feature with which it is found in 50 % of the twins; see `estimate`."""
         return self._ions_for(0.5)
 
-    @property
+    @cached_property
     def n95(self) -> Estimated:
         """Recorded ions of the feature with which it is found in 95 % of the twins; see `estimate`."""
         return self._ions_for(0.95)
