@@ -76,21 +76,28 @@ def write_dump(path, radius=1.1):
     return path
 
 
+def has_begun(sweep, *keys):
+    """Whether checkpoints of all these points are on the disk."""
+    return all((sweep.folder_of(key) / "run.h5.unfinished").exists() for key in keys)
+
+
 class Killer:
-    """Kills a random process every few seconds while the block lasts.
+    """Kills a random process again and again while the block lasts, but only while a point is half run.
+
+    What it waits for is the work, not the clock: on a fast machine, it kills as many.
 
     Parameters
     ----------
+    sweep : Sweep
+        The points that are run.
     processes : callable
         Returns the numbers of the processes that may be killed.
-    seconds : float
-        Mean time between two of them [s].
     most : int
         Largest number.
     """
 
-    def __init__(self, processes, seconds, most=1000, seed=1):
-        self.processes, self.seconds, self.most = processes, seconds, most
+    def __init__(self, sweep, processes, most, seed=1):
+        self.sweep, self.processes, self.most = sweep, processes, most
         self.killed = []
         self._random, self._stop = random.Random(seed), threading.Event()
         self._thread = threading.Thread(target=self._kill)
@@ -104,14 +111,17 @@ class Killer:
         self._thread.join()
 
     def _kill(self):
-        while not self._stop.wait(self.seconds * self._random.uniform(0.5, 1.5)) and len(self.killed) < self.most:
-            if numbers := self.processes():
+        pause = 0.0
+        while len(self.killed) < self.most and not self._stop.wait(pause):
+            pause = 0.01
+            if any(has_begun(self.sweep, key) for key in self.sweep.keys) and (numbers := self.processes()):
                 number = self._random.choice(numbers)
                 try:
                     os.kill(number, signal.SIGKILL)
                 except ProcessLookupError:
                     continue
                 self.killed.append(number)
+                pause = self._random.uniform(0.5, 3.0)  # most points end in between
 
 
 def single_fingerprint(sweep, key):

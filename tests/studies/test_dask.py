@@ -29,7 +29,7 @@ def test_twelve_points_by_a_cluster_whose_workers_are_killed(tmp_path, capsys):
             numbers = [worker.process.pid for worker in cluster.workers.values() if worker.process is not None]
             return [number for number in numbers if number and os.path.exists(f"/proc/{number}")]
 
-        with patience, Killer(workers, 5.0, most=6) as killer:
+        with patience, Killer(sweep, workers, most=6) as killer:
             assert sweep.state(good[0]).name == "waiting"
             states = run_sweep_with_dask(sweep, cluster.scheduler_address)
             assert set(states) == set(sweep.keys)

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from sweeps import Killer, check_bits, check_done, command, living_children, planned, poison
+from sweeps import Killer, check_bits, check_done, command, has_begun, living_children, planned, poison
 
 from apt_evap._common.files import FileError
 from apt_evap.cli.main import main
@@ -57,11 +57,6 @@ def runs_of(process):
 
 def victims_of(process):
     return [*runs_of(process), process.pid]
-
-
-def has_begun(sweep, *keys):
-    """Whether checkpoints of all these points are on the disk."""
-    return all((sweep.folder_of(key) / "run.h5.unfinished").exists() for key in keys)
 
 
 def is_alive(number):
@@ -253,7 +248,7 @@ def test_twelve_points_by_processes_that_are_killed(tmp_path):
     killed, calls = [], 0
     while {state.name for _, state in sweep.states()} != {"done"}:
         process, calls = command(sweep, "--workers", "3"), calls + 1
-        with Killer(partial(victims_of, process), 5.0, most=10 - len(killed), seed=calls) as killer:
+        with Killer(sweep, partial(victims_of, process), most=10 - len(killed), seed=calls) as killer:
             assert process.wait(300) in (0, 2, -signal.SIGKILL)
         killed += killer.killed
         assert calls <= 11
