@@ -137,11 +137,20 @@ def set_log_ticks(axis: Axis, least_range: float = 1.0) -> None:
 
 
 class _Layout(ConstrainedLayoutEngine):
-    """Repeated constrained layout: ticks and labels of maps with equal scales in x and y depend on their size."""
+    """Constrained layout, again while it changes the ticks: those of maps with equal scales depend on their size."""
 
     def execute(self, fig: Figure) -> None:
+        ticks = _ticks(fig)
         for _ in range(3):
             super().execute(fig)
+            before, ticks = ticks, _ticks(fig)
+            if ticks == before:  # a second pass moves axes by less than a pixel
+                break
+
+
+def _ticks(figure):
+    """Places of the ticks of all axes."""
+    return [tuple(axis.get_majorticklocs()) for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
 
 
 class _Figure(Figure):

@@ -171,12 +171,12 @@ def test_packed_parts_keep_every_bit_of_a_number(run):
     assert packed.run(last=True).responses.site.tobytes() == site.tobytes()
 
 
-def test_ions_of_packed_parts_take_less_than_four_fifths_of_a_kilobyte(run):
+def test_ions_of_packed_parts_take_less_than_0_7_kilobytes(run):
     packed = PackedParts()
     packed.add(run)
     size = sum(len(part.memory) for part in packed._parts) / len(run)
     whole = sum(values.nbytes for values in columns_of(run, run.every_column).values()) / len(run)
-    assert size < 800 < 1400 < whole
+    assert size < 700 < 1400 < whole
 
 
 def test_packed_parts_are_joined_without_a_second_copy(run20):
