@@ -117,7 +117,7 @@ def test_an_interrupt_saves_all_ions_and_the_next_call_continues(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", [0.3, 1.5])
 def test_an_interrupt_ends_the_work_at_any_time(tmp_path, moment):
-    sweep = planned(tmp_path, TWO_LONG, LONG)
+    sweep = planned(tmp_path, TWO_LONG, LONG.replace("1000", "5000"))  # of 6,600 atoms: 10 s of one core for each
     process = command(sweep, "--workers", "2")
     with pytest.raises(subprocess.TimeoutExpired):
         process.wait(moment)
