@@ -17,7 +17,7 @@ from apt_evap.simulation.config.cost_estimate import estimate_cost
 from apt_evap.simulation.config.simulation_file import config_of, read_document
 from apt_evap.simulation.config.simulation_settings import Config
 from apt_evap.simulation.recorder import RunInterrupted
-from apt_evap.simulation.run import Run
+from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.simulation.stop_reason import StopReason
@@ -178,6 +178,13 @@ def simulate(
     cost = estimate_cost(config, 1)
     stored = Checkpoint(path, checkpoint, resume=resume, overwrite=overwrite)
     n_previous = stored.ions_there() if resume else 0
+    complete = n_previous == n_ions and not stored.unfinished.exists()
+    if complete and (run := load(path)).provenance.get("settings") == config.key:
+        if picture.exists():
+            note(f"{path} is complete: nothing to do, overwrite=True (--force) begins again")
+            return Simulated(run, path, None, [], [], 0.0)
+        note(f"{path} is complete")
+        return _drawn(run, path, picture, config, 0.0, note)
     if seconds is not None:
         note(f"at most {n_ions:,} ions, as many as the time allows")
     elif n_previous != n_ions:
@@ -185,19 +192,12 @@ def simulate(
     note("building the specimen and relaxing the charges of its surface")
     simulation = config.simulation(n_threads=threads)
     note(f"{str(simulation.tip).strip('<>')}; {len(simulation.emitter):,} atoms on the surface")
-    began = time.perf_counter()
-    replaced, unfinished = path.exists(), stored.unfinished.exists()
+    began, replaced = time.perf_counter(), path.exists()
     if 0 < n_previous < n_ions:
         note(f"resumed at {n_previous:,} of {n_ions:,} ions")
     left = None if seconds is None else _less(seconds, time.monotonic() - called)
     run = _evaporated(config, simulation, stored, n_previous, progress, {"seconds": left, "fewest": fewest})
     seconds = time.perf_counter() - began
-    if n_previous == n_ions and not unfinished and run.provenance.get("settings") == config.key:
-        if picture.exists():
-            note(f"{path} is complete: nothing to do, overwrite=True (--force) begins again")
-            return Simulated(run, path, None, [], [], seconds)
-        note(f"{path} is complete")
-        return _drawn(run, path, picture, config, seconds, note)
     run = config.as_saved(run)
     run.save(path)
     new = "" if not n_previous else f", {len(run) - n_previous:,} of them new,"
