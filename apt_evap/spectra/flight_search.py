@@ -9,7 +9,7 @@ import numpy as np
 from apt_evap.detection.hits import Hits
 from apt_evap.spectra.flight_fit import FlightFit
 from apt_evap.spectra.ion_names import COMMON, GASES, HIGHEST_CHARGE, NOBLE
-from apt_evap.spectra.isotope_comb import LARGEST_MISFIT, Comb, LogSpectrum
+from apt_evap.spectra.isotope_comb import Comb, LogSpectrum
 
 _MOLECULES = ("H2", "OH", "H2O", "N2", "O2", "CO")  # of the residual gas
 _RARE = 0.7  # weight of the ions that a rare element explains
@@ -119,9 +119,7 @@ def _candidates(counts, formulas, tolerance):
         comb
         for formula in dict.fromkeys([*_ELEMENTS, *_MOLECULES, *(formulas or ())])
         for charge in _charges(formula, formula in (formulas or ()))
-        if (comb := counts.comb(formula, charge, *bounds)) is not None
-        and comb.fill >= 1 - LARGEST_MISFIT
-        and comb.intervals
+        if (comb := counts.comb(formula, charge, *bounds)) is not None and comb.intervals
     ]
     usual = {*COMMON, *GASES, *_MOLECULES, *(formulas or ())}
     scores = {comb: comb.ions * comb.fill * (1.0 if comb.formula in usual else _RARE) for comb in combs}

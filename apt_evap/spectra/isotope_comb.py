@@ -12,7 +12,7 @@ from apt_evap.spectra.ion_names import Abundances, ion_name
 
 STEP = 5e-4
 """Width of a bin of the logarithm of m/n: half the width of a peak of a good instrument."""
-LARGEST_MISFIT = 0.3
+_LARGEST_MISFIT = 0.3
 """Largest part of the ions about a comb that it does not explain. Measured: 0.10 for W, 0.32 for Re and 0.55 for Ta in
 the spectrum of W."""
 _LOWEST, _HIGHEST = 0.5, 400.0  # m/n [Da]
@@ -32,6 +32,7 @@ _EVIDENT = 3.0  # standard deviations above the background of such a peak, and i
 _FOOT = 0.01  # height over that of the peak at its ends
 _RISE = 1.3  # another peak begins at this many times the lowest height between them
 _PEAK = 9  # bins over which ions are added to see a peak
+_NATURAL = Abundances()
 
 
 def in_intervals(masses: Floats, intervals: Sequence[tuple[float, float]]) -> Booleans:
@@ -90,6 +91,7 @@ class LogSpectrum:
         bins = np.clip(np.floor(np.log(inside) / STEP).astype(np.int64) - self._first, 0, last - self._first - 1)
         self.counts = np.bincount(bins, minlength=last - self._first).astype(np.float64)
         self.background = _background_of(self.counts)
+        self._combs: dict[tuple[str, int, float, float], Comb | None] = {}
         self._add_up()
 
     def _add_up(self):
@@ -102,6 +104,11 @@ class LogSpectrum:
         for low, high in intervals:
             first, last = np.searchsorted(self.edges, (low * (1 - _BESIDE), high * (1 + _BESIDE)))
             rest.counts[first:last] = self.background[first:last]
+        rest._combs = {
+            key: comb
+            for key, comb in self._combs.items()
+            if not any(_reaches(*key, low * (1 - _BESIDE), high * (1 + _BESIDE)) for low, high in intervals)
+        }
         rest._add_up()
         return rest
 
@@ -120,11 +127,18 @@ class LogSpectrum:
         Returns
         -------
         Comb or None
-            None without ions above the background.
+            None without ions above the background, or if it does not explain enough of those about it.
         """
+        key = formula, charge, low, high
+        if key not in self._combs:
+            self._combs[key] = self._best_comb(*key)
+        return self._combs[key]
+
+    def _best_comb(self, formula, charge, low, high):
+        """The same, computed."""
         from scipy.ndimage import gaussian_filter1d
 
-        masses, abundances = Abundances().lines(formula)
+        masses, abundances = _NATURAL.lines(formula)
         common = abundances > _RARE
         masses, abundances = masses[common], abundances[common] / abundances[common].sum()
         places = np.log(masses / charge) / STEP - self._first  # in bins
@@ -153,9 +167,12 @@ class LogSpectrum:
             if explained[at] * net[at] > best[0]:
                 best = float(explained[at] * net[at]), at, width
         score, at, width = best
+        fill = score / float(net[at])
+        if fill < 1 - _LARGEST_MISFIT:
+            return None
         intervals = self._intervals(places + shifts[at], abundances, width / STEP, score)
         factor = math.exp(STEP * shifts[at])
-        return Comb(formula, charge, factor, score / float(net[at]), score, width, intervals)
+        return Comb(formula, charge, factor, fill, score, width, intervals)
 
     def _intervals(self, places, abundances, width, number):
         """Bounds of the peaks of a number of ions at some places [bins], joined where they touch."""
@@ -193,6 +210,12 @@ class LogSpectrum:
             elif smooth[at] > _RISE * lowest + 3 * math.sqrt(lowest + 1):
                 return last
         return at
+
+
+def _reaches(formula, charge, low, high, first, last):
+    """Whether a comb of an ion, for factors between low and high, depends on the ions from first to last m/n [Da]."""
+    masses = _NATURAL.lines(formula)[0] / charge
+    return low * masses[0] * (1 - 2 * _MARGIN) < last and high * masses[-1] * (1 + 2 * _MARGIN) > first
 
 
 def _shapes(places, abundances, size) -> Iterator[tuple[Floats, float]]:

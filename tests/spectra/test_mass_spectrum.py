@@ -224,6 +224,24 @@ def test_a_slow_comb_gives_the_same():
     assert comb.fill > 0.9
 
 
+def test_combs_are_kept_where_no_ions_were_removed():
+    """Of a spectrum without some peaks, those that were found before are what a search in that spectrum finds."""
+    rng = np.random.default_rng(7)
+    ions = {("Fe", 2): 8, ("Cr", 2): 2, ("Ni", 2): 2, ("Cu", 1): 2, ("Mo", 3): 2, ("C", 1): 1}
+    mass = masses_of(ions, 30_000, rng) * rng.normal(1.01, 7e-4, 30_000)
+    tried = [(formula, charge, 0.99, 1.03) for formula, charge in [*ions, ("Al", 1), ("Ti", 2), ("Zn", 1), ("W", 3)]]
+    searched, fresh = LogSpectrum(mass), LogSpectrum(mass)
+    before = [searched.comb(*ion) for ion in tried]
+    for number in (0, 3):
+        searched, fresh = (counts.without(before[number].intervals) for counts in (searched, fresh))
+        after = [searched.comb(*ion) for ion in tried]
+        fresh._combs.clear()
+        assert after == [fresh.comb(*ion) for ion in tried]
+        fresh._combs.clear()
+        assert after[number] is None
+    assert sum(one is other for one, other in zip(before, after, strict=True) if one) >= 2  # far from iron and copper
+
+
 def test_saved_ranges_are_read_again(tmp_path):
     rng = np.random.default_rng(6)
     ions = {("Cr", 2): 3, ("CrO", 1): 1}
