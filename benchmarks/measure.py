@@ -21,10 +21,7 @@ from apt_evap._core.interactions import InteractionLists, direct_field
 from apt_evap._core.journal import Journal
 from apt_evap._core.octree import Octree
 from apt_evap._core.robin import Robin
-from apt_evap.emission.surface_frame import tangent_frame
-from apt_evap.evaporation.emitter import Emitter
 from apt_evap.simulation.flight.response import ResponseModel
-from apt_evap.units import COULOMB
 
 NICKEL = ae.material("Ni")
 A = NICKEL.a
@@ -65,7 +62,7 @@ def processor():
 
 def fields(radius=80, shank=3.0, targets=2000, angles=(0.5, 0.6, 0.7, 0.75, 0.8), threads=(1, 2)):
     """Field at all surface atoms from interaction lists; times relative to a direct float64 sum in the same run."""
-    emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=max(threads))
+    emitter = ae.evaporation.Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=max(threads))
     positions, n = np.ascontiguousarray(emitter.positions), len(emitter)
     charges = np.random.default_rng(1).uniform(0.5, 1.5, n)
     tree = Octree(positions, charges)
@@ -109,7 +106,7 @@ def solutions(radii=(20, 40, 80), shank=2.0, n_threads=2):
     """Number of sweeps and time from equal start charges, with and without mixing."""
     rows = []
     for radius in radii:
-        emitter = Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=n_threads)
+        emitter = ae.evaporation.Emitter(nickel_tip(radius, shank, depth=5.0), n_threads=n_threads)
         core = emitter._core
         lists = InteractionLists(core.tree, emitter.settings.opening_angle, n_threads)
         for window in (0, 8):
@@ -172,7 +169,7 @@ def rates(radii=(20, 40, 80), shank=2.0, ions=10_000, threads=(1, 2), depth=8.0)
                 start = time.perf_counter()
                 simulation.run(ions, responses=responses, progress=False)
                 speeds.append(ions / (time.perf_counter() - start))
-            constant = Emitter(simulation.tip, rule=ae.ConstantPotential(), n_threads=n_threads)
+            constant = ae.evaporation.Emitter(simulation.tip, rule=ae.ConstantPotential(), n_threads=n_threads)
             constant_potential = sum(evaporate(constant, ions))
             del constant
             rows.append(
@@ -207,7 +204,7 @@ def charge_errors(radii=(40, 80), shank=1.0, sections=6):
             emitters, times = {}, {10: [], 1: []}
             for whole_interval in times:
                 settings = ae.evaporation.ChargeSettings(whole_interval=whole_interval)
-                emitters[whole_interval] = Emitter(tip, rule=rule, settings=settings, n_threads=1)
+                emitters[whole_interval] = ae.evaporation.Emitter(tip, rule=rule, settings=settings, n_threads=1)
             for _ in range(sections):
                 for number, emitter in emitters.items():
                     times[number].append(evaporate(emitter, 10 * emitter.sweep_interval, time.process_time))
@@ -252,8 +249,8 @@ def potentials(radii=(5, 7, 10, 14, 20), events=1000, step=25, n_threads=1):
         tip = ae.Tip(NICKEL, radius * A, axis=(1, 1, 1))
         for rule, bound in ((ae.Robin(), 1.0), (ae.Robin(), 4e-3), (ae.ConstantPotential(), 4e-3)):
             settings = ae.evaporation.ChargeSettings(potential_bound=bound)
-            emitter = Emitter(tip, rule=rule, settings=settings, n_threads=n_threads)
-            exact = Emitter(tip, rule=rule, n_threads=n_threads)
+            emitter = ae.evaporation.Emitter(tip, rule=rule, settings=settings, n_threads=n_threads)
+            exact = ae.evaporation.Emitter(tip, rule=rule, n_threads=n_threads)
             removed, n, errors = [], 0, []
             for batch in emitter.advance(events, batch_size=step):
                 removed.append(batch.site)
@@ -288,14 +285,14 @@ def flights(radii=(20, 40, 80, 120), shank=2.0, ions=256, group=17):
     """Time and evaluations of a flight, alone and in a group with common walks through the octree; one thread."""
     rows = []
     for radius in radii:
-        emitter = Emitter(nickel_tip(radius, shank))
+        emitter = ae.evaporation.Emitter(nickel_tip(radius, shank))
         batch = emitter.evaporate(min(ions, emitter.sweep_interval))
         tip, settings = emitter.tip, ae.simulation.FlightSettings()
         speed = np.sqrt(2 * 0.5)  # 0.5 eV, charge state 1
         for launches in (1, group):
             flier = flier_over(batch.tree, tip, settings)
             angle = np.tile(2 * np.pi * np.arange(launches) / launches, len(batch))
-            first, second = (np.repeat(t, launches, axis=0) for t in tangent_frame(batch.normals))
+            first, second = (np.repeat(t, launches, axis=0) for t in ae.emission.tangent_frame(batch.normals))
             velocities = speed * (np.cos(angle)[:, None] * first + np.sin(angle)[:, None] * second)
             positions = np.repeat(tip.positions[batch.site], launches, axis=0)
             start = time.perf_counter()
@@ -319,7 +316,7 @@ def flier_over(tree, tip, settings):
     """Flights in the field of a tree, with the settings of `Simulation`."""
     return Flights(
         tree,
-        coulomb=COULOMB,
+        coulomb=ae.units.COULOMB,
         length=tip.nearest_neighbour_distance,
         centre=(0.0, 0.0, tip.apex),
         reach=settings.reach * tip.nearest_neighbour_distance,
@@ -346,14 +343,14 @@ def flight_errors(radii=(40, 80), shank=1.0, ions=300):
     """
     rows = []
     for radius in radii:
-        emitter = Emitter(nickel_tip(radius, shank), n_threads=1)
+        emitter = ae.evaporation.Emitter(nickel_tip(radius, shank), n_threads=1)
         evaporate(emitter, int(1.5 * emitter.sweep_interval))
         positions, normals, fields, tip = emitter.positions, emitter.normals, emitter.fields, emitter.tip
         tree = Octree(np.ascontiguousarray(positions), emitter.charges.copy())
         random = np.random.default_rng(0)
         cap = positions[:, 2] > np.hypot(positions[:, 0], positions[:, 1])
         chosen = random.choice(np.flatnonzero(cap & (fields > np.quantile(fields[cap], 0.9))), ions, replace=False)
-        first, second = tangent_frame(normals[chosen])
+        first, second = ae.emission.tangent_frame(normals[chosen])
         angle, energy = random.uniform(0, 2 * np.pi, (ions, 1)), random.uniform(0, 1.0, (ions, 1))
         energy[: ions // 2] = 0.0
         velocities = np.sqrt(2 * energy) * (np.cos(angle) * first + np.sin(angle) * second)
@@ -470,7 +467,7 @@ def place_errors(radius=40, shank=1.0, events=5000, ions=200, n_threads=2):
             double_precision=True,
             n_threads=n_threads,
         )
-        potential = COULOMB * tree.potentials(tip.potential_point[None], 0.0)[0]
+        potential = ae.units.COULOMB * tree.potentials(tip.potential_point[None], 0.0)[0]
         tree.charges = tree.charges * (simulation.voltage / potential)
         flier = flier_over(tree, tip, ae.simulation.FlightSettings(opening_angle=0.0, tolerance=1e-6))
         end, _ = fly(flier, Journal(tip.positions, 1), [-1], 1, run.emissions.positions, np.zeros((1, 3)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,10 +12,9 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_count, check_kind, short_text
 from apt_evap.detection.binning import MAX_BINS, count
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS, field_of_ratio
 from apt_evap.specimen.isotopes import ISOTOPES
-from apt_evap.spectra.mass_ranges import Ranges
 
 LEAST = 20
 """Fewest ions of both charges for a ratio: 1.5 % of the field where both are equally frequent."""
@@ -24,7 +22,6 @@ _PER_BIN = 50  # ions per bin by default: 1 % of the field where both charges ar
 _PER_SECTION = 100  # ions per section of a history by default
 _MOST_BINS = 256  # by default, as in `DetectorMap.from_hits`
 _HIGHEST = 118  # charge [e]
-_CLOSE = 0.02  # an ion whose isotopes are this far outside its range is another one; peaks have tails of 1 %
 _MASSES = (0.9, 1.2)  # mass of a simulated ion over that of an isotope, with all errors of its time of flight
 _STRANGERS = 0.01  # fraction of the ions that may have other masses
 
@@ -168,7 +165,7 @@ def charge_state_ratio_map(
     element: str,
     charge: int | None = None,
     *,
-    ranges: Ranges | None = None,
+    ranges: MassRanges | None = None,
     bins: int | None = None,
     extent: tuple[float, float, float, float] | None = None,
     like: DetectorMap | ChargeStateMap | None = None,
@@ -248,7 +245,7 @@ def charge_state_ratio_history(
     element: str,
     charge: int | None = None,
     *,
-    ranges: Ranges | None = None,
+    ranges: MassRanges | None = None,
     sections: int | None = None,
     least: int = LEAST,
 ) -> ChargeStateHistory:
@@ -320,12 +317,8 @@ def charge_history(
     return ChargeStateHistory(element, charge, lower, upper, least, (edges[:-1] + edges[1:]) / 2)
 
 
-def ion_charges(hits: Hits, element: str, ranges: Ranges | None = None) -> Integers:
-    """Charge of every ion of an element.
-
-    Ranges do not state charges. The charge of a range is the mass of the element over its centre, rounded: 58.7 Da over
-    29.3 Da is Ni2+. Only ranges of single atoms count: their composition is one atom of the element, or, if they have
-    none, their name is the element, with or without a charge, such as "Ni", "Ni++" or "Ni2+".
+def ion_charges(hits: Hits, element: str, ranges: MassRanges | None = None) -> Integers:
+    """Charge of every ion of an element, that of the run or of `Ranges.charges`.
 
     Parameters
     ----------
@@ -345,8 +338,7 @@ def ion_charges(hits: Hits, element: str, ranges: Ranges | None = None) -> Integ
     check_kind(hits, "hits", Hits, "Hits")
     check_kind(element, "element", str, "a chemical symbol such as 'Ni'")
     if ranges is not None:
-        check_kind(ranges, "ranges", Ranges, "Ranges")
-        return np.array([*_charges_of_ranges(ranges, element), 0])[ranges.index(hits)]
+        return check_kind(ranges, "ranges", "charges", "Ranges").charges(hits, element)
     if "charge_state" not in hits.extra:
         raise ValueError(
             f"{hits.source or 'these hits'} have no charges: pass ranges=read_ranges(...) for measured ions, or use "
@@ -377,35 +369,6 @@ def field_of_counts(element: str, charge: int, lower: ArrayLike, upper: ArrayLik
     ratio, error = ratio_of_counts(lower, upper)
     low, field, high = (field_of_ratio(element, charge, ratio * np.exp(step * error)) for step in (-1, 0, 1))
     return field, (high - low) / 2
-
-
-def _charges_of_ranges(ranges, element):
-    """Charge of the ions of each range; 0 for other ions than single atoms of the element."""
-    check_choice(element, "element", ISOTOPES)
-    masses = np.array(ISOTOPES[element])[:, 0]
-    name = re.compile(re.escape(element) + r"(\+*|\^?[1-9]\+)")
-    charges = []
-    for i, (low, high, atoms) in enumerate(zip(ranges.low, ranges.high, ranges.composition, strict=True)):
-        single = atoms == {element: 1} if atoms else name.fullmatch(ranges.names[i].replace(" ", ""))
-        charge = _nearest_charge(masses, (low + high) / 2) if single else 0
-        if single and not (low < (1 + _CLOSE) * masses.max() / charge and high > (1 - _CLOSE) * masses.min() / charge):
-            raise ValueError(
-                f"{ranges.source or 'ranges'}: {low:g} to {high:g} Da is not a range of {element}, whose isotopes have "
-                f"{masses.min():.1f} to {masses.max():.1f} Da over the charge"
-            )
-        charges.append(charge)
-    if not any(charges):
-        raise ValueError(
-            f"{ranges.source or 'ranges'} have no range of single atoms of {element}, only of "
-            f"{', '.join(ranges.species_names)}"
-        )
-    return charges
-
-
-def _nearest_charge(masses, mass_to_charge):
-    """Charge with which an isotope is nearest to a mass-to-charge ratio [Da]."""
-    charges = np.arange(1, _HIGHEST + 1)
-    return 1 + int(abs(masses[:, None] / charges - mass_to_charge).min(axis=0).argmin())
 
 
 def _check_masses(masses, element):

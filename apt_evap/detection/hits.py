@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.codec import check_itself
 from apt_evap._common.notebook import as_table
-from apt_evap._common.types import Booleans, Column, Floats
+from apt_evap._common.types import Booleans, Column, Floats, Integers
 from apt_evap._common.validation import (
     check_array,
     check_kind,
@@ -47,6 +47,27 @@ class Outcome(IntEnum):
     """The ion never left the specimen."""
     OUTSIDE = 3
     """The ion does not arrive in the field of view of the flights, see `FlightSettings`; it may not have been flown."""
+
+
+class MassRanges(Protocol):
+    """What packages that need no spectra use of `Ranges` of mass: the species of every ion."""
+
+    @property
+    def species_names(self) -> tuple[str, ...]:
+        """Names of the species, each once."""
+        ...
+
+    def charges(self, hits: Hits, element: str) -> Integers:
+        """Charge of every ion of an element [e], shape (n,); 0 for others."""
+        ...
+
+    def species(self, hits: Hits) -> Integers:
+        """Index of every ion into `species_names`, shape (n,); -1 for an ion in no range."""
+        ...
+
+    def labels(self, hits: Hits, outside: str = "X") -> NDArray[np.str_]:
+        """Name of the species of every ion, shape (n,), `outside` for an ion in no range."""
+        ...
 
 
 _FLOAT = ("x", "y", "time_of_flight", "voltage", "pulse_voltage", "mass_to_charge", "positions")
@@ -134,7 +155,7 @@ class Hits:
     extra: dict = field(default_factory=dict)
     units: dict = field(default_factory=dict)
     source: str = ""
-    ranges: Any = None
+    ranges: MassRanges | None = None
     extent: tuple[float, float, float, float] | None = None
 
     def __post_init__(self):
@@ -253,7 +274,7 @@ class Hits:
         """
         return DetectorMap.from_hits(self, bins=bins, **options)
 
-    def to_dataframe(self, ranges: Any = None) -> pandas.DataFrame:
+    def to_dataframe(self, ranges: MassRanges | None = None) -> pandas.DataFrame:
         """Return the ions as a pandas DataFrame; needs pandas.
 
         Parameters

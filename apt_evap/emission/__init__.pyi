@@ -1,6 +1,7 @@
 # The public names of this package: read by type checkers, and by the lazy loader in __init__.py.
 from .emissions import Emissions as Emissions
 from .emissions import Launches as Launches
+from .emissions import TangentialLaunches as TangentialLaunches
 from .energies import Thermal as Thermal
 from .perturbations import IonRandom as IonRandom
 from .perturbations import Mixture as Mixture
@@ -12,3 +13,4 @@ from .roll_probability import ChargeRatio as ChargeRatio
 from .roll_probability import Migration as Migration
 from .surface_frame import launch_tangentially as launch_tangentially
 from .surface_frame import rollup_direction as rollup_direction
+from .surface_frame import tangent_frame as tangent_frame

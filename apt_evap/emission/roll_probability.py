@@ -162,7 +162,7 @@ class Migration(_ByChargeRatio):
         charges = AT_REST + BY_CHARGE * ratios
         gained = self.polarization * (charges * charges - 1.0)
         kt = BOLTZMANN * self.temperature
-        return _fermi(gained - self._cost, kt)
+        return _fermi(gained - self.cost, kt)
 
     @property
     def polarization(self) -> float:
@@ -170,14 +170,14 @@ class Migration(_ByChargeRatio):
         return 0.5 * self.polarizability / (1e-18 * ELEMENTARY_CHARGE) * self.field**2  # F m^2 to e nm^2/V
 
     @property
-    def _cost(self):
+    def cost(self) -> float:
         """Bonds of the hop less the barrier of evaporation [eV]."""
         return self.bonds_lost * self.cohesive_energy - EVAPORATION_BARRIER * BOLTZMANN * self.temperature
 
     @property
     def gain_needed(self) -> float:
         """phi^2 - 1 above which an atom rolls up."""
-        return self._cost / self.polarization
+        return self.cost / self.polarization
 
     @property
     def threshold(self) -> float:

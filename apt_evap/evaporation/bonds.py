@@ -8,7 +8,7 @@ import numpy as np
 from apt_evap._common.codec import checked, from_plain, is_plain, number, settings
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_count, check_number, short_text
-from apt_evap.specimen.lattice import SECOND_SHELL_FACTORS
+from apt_evap.specimen.lattice import COORDINATION, SECOND_SHELL_FACTORS
 from apt_evap.specimen.materials import MATERIALS
 from apt_evap.specimen.tip import Tip
 
@@ -49,8 +49,6 @@ From first, second and third ionisation energies (NIST Atomic Spectra Database) 
 (Michaelson, J. Appl. Phys. 48, 4729, 1977).
 """
 
-COORDINATION = {"fcc": (12, 6), "hcp": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12)}
-"""Nearest and second neighbours of an atom in the bulk."""
 _BITS = 4  # per count of neighbours: up to 15
 _LEAST = 0.1  # of the energy at a kink: repulsive bonds cannot lower the field below 1 %
 _MOST = 4  # counts: tables of 16^4 numbers

@@ -11,8 +11,9 @@ from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import short_text
 from apt_evap._core.law import LawKernel, PythonLaw, WeightedField
 from apt_evap.emission.roll_probability import AT_REST, BY_CHARGE, Migration
-from apt_evap.evaporation.bonds import COORDINATION, BondField, bond_table, bonds_field
+from apt_evap.evaporation.bonds import BondField, bond_table, bonds_field
 from apt_evap.evaporation.voltage import ThermalLaw, VoltageControl
+from apt_evap.specimen.lattice import COORDINATION
 from apt_evap.specimen.tip import Tip
 
 _SAME_FIELD = 0.01  # relative; the barrier of another metal differs by more

@@ -14,7 +14,7 @@ from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_kind, check_number
 from apt_evap.analysis.charge_states import LEAST, charge_history, field_of_counts, ion_charges, ratio_of_counts
 from apt_evap.detection.detector_map import DetectorMap
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS
 from apt_evap.fit.start_settings import FIELD_FACTOR, FIELD_FACTORS, has_voltage, voltages_of, without_strays
@@ -25,7 +25,6 @@ from apt_evap.reconstruction.reconstruct import reconstruct
 from apt_evap.reconstruction.shank import fit_shank
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
-from apt_evap.spectra.mass_ranges import Ranges
 
 _ENDS = 1000  # ions at the beginning and at the end, for the voltages there
 _IONS = 20_000  # that are reconstructed for the angle of the shank
@@ -175,7 +174,7 @@ def constants_of(
     field_factor: float | None = None,
     distance: float | None = None,
     efficiency: float = 0.5,
-    ranges: Ranges | None = None,
+    ranges: MassRanges | None = None,
 ) -> Measurement:
     r"""Determine the constants of a measurement with errors, and check them.
 

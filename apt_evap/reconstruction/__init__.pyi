@@ -15,5 +15,6 @@ from .precipitate import precipitate_errors as precipitate_errors
 from .reconstruction_settings import ReconstructionSettings as ReconstructionSettings
 from .shank import fit_shank as fit_shank
 from .specimen_check import check_specimen as check_specimen
+from .truth_comparison import TruthComparison as TruthComparison
 from .truth_comparison import compare_with_truth as compare_with_truth
 from .truth_comparison import corrected as corrected

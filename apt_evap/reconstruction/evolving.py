@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_array, check_number, check_sequence, did_you_mean
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
 from apt_evap.reconstruction.evolving_surface import DEPTH_WINDOW, EvolvingSurface, IonSequence, SurfacePass
@@ -37,7 +37,6 @@ from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettin
 from apt_evap.reconstruction.voltage_course import smoothed, without_jumps
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.tip import Tip
-from apt_evap.spectra.mass_ranges import Ranges
 
 FEWEST_IONS = 2000
 """Fewest ions that a surface is integrated from: 20 in each step of a specimen that recedes by R / 1.3."""
@@ -397,7 +396,7 @@ class _Fixed(NamedTuple):
 def follow_surface(
     hits: Hits,
     settings: ReconstructionSettings,
-    ranges: Ranges | None = None,
+    ranges: MassRanges | None = None,
     solutes: Sequence[str] = (),
     labels: ArrayLike | None = None,
 ) -> EvolvingReconstruction:

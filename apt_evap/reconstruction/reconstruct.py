@@ -8,12 +8,11 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import check_choice, check_kind, short_text
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.reconstruction.evolving import follow_surface
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruction
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings, resolved_settings
-from apt_evap.spectra.mass_ranges import Ranges
 
 SHAPES = ("cap", "evolving")
 """Surfaces: a sphere, or the shape that is integrated from the ions."""
@@ -24,7 +23,7 @@ def reconstruct(
     settings: ReconstructionSettings | None = None,
     *,
     shape: str = "cap",
-    ranges: Ranges | None = None,
+    ranges: MassRanges | None = None,
     solutes: Sequence[str] = (),
     labels: ArrayLike | None = None,
     origins: OriginTable | None = None,
@@ -100,7 +99,7 @@ def reconstruct(
     """
     check_kind(hits, "hits", Hits, "Hits, such as read(path) or run.hits(perturbation)")
     if ranges is not None:
-        check_kind(ranges, "ranges", Ranges, "Ranges, such as ae.io.read_ranges(path)")
+        check_kind(ranges, "ranges", "species", "Ranges, such as ae.io.read_ranges(path)")
     if origins is not None:
         check_kind(origins, "origins", OriginTable, "an OriginTable, such as origin_table(runs)")
     chosen = check_choice(shape, "shape", SHAPES)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice
-from apt_evap.detection.hits import Hits
+from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.measures.interface import CompositionProfile
 from apt_evap.measures.point_cloud import Clusters, PointCloud
 from apt_evap.reconstruction.cap_geometry import CapGeometry, depths_below_apex, polar_angles, voltages_of
@@ -121,7 +121,7 @@ class Reconstruction:
         chosen = check_choice(frame, "frame", FRAMES)
         return replace(self.hits, positions=self.positions if chosen == "depth" else self.specimen_positions)
 
-    def cloud(self, ranges: Any = None, frame: str = "depth") -> PointCloud:
+    def cloud(self, ranges: MassRanges | None = None, frame: str = "depth") -> PointCloud:
         """The reconstructed ions with their species, for measures such as `measures.PointCloud.clusters`.
 
         Parameters
@@ -137,11 +137,11 @@ class Reconstruction:
         """
         return PointCloud.of(self.to_hits(frame), ranges)
 
-    def clusters(self, *arguments: Any, ranges: Any = None, **options: Any) -> Clusters:
+    def clusters(self, *arguments: Any, ranges: MassRanges | None = None, **options: Any) -> Clusters:
         """Clusters of a solute, see `measures.PointCloud.clusters`; ranges as for `cloud`."""
         return self.cloud(ranges).clusters(*arguments, **options)
 
-    def proxigram(self, *arguments: Any, ranges: Any = None, **options: Any) -> CompositionProfile:
+    def proxigram(self, *arguments: Any, ranges: MassRanges | None = None, **options: Any) -> CompositionProfile:
         """Proxigram of an isosurface, see `measures.PointCloud.proxigram`; ranges as for `cloud`."""
         return self.cloud(ranges).proxigram(*arguments, **options)
 

@@ -12,7 +12,6 @@ import scipy
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
 from apt_evap.analysis.apex import image_compression
-from apt_evap.emission.perturbations import Unperturbed
 from apt_evap.evaporation.rule import ConstantPotential
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
 from apt_evap.simulation.simulation import Simulation
@@ -114,13 +113,12 @@ def _simulated(tips, sequence):
     total = int(_MORE * wanted / math.sin(sequence.rim) ** 2)
     compression = None
     for tip in tips:
-        run = Simulation(tip, seed=1, rule=ConstantPotential()).run(
-            min(total, len(tip.positions)), [Unperturbed()], responses=False, progress=False
-        )
+        simulation = Simulation(tip, seed=1, rule=ConstantPotential())
+        run = simulation.run(min(total, len(tip.positions)), responses=False, progress=False)
         run.unless_interrupted()
         if compression is None:
             compression = image_compression(run).compression
-        hits = run.hits(Unperturbed())
+        hits = run.hits(run.first_perturbation)
         x, y = hits.x[hits.detected] / run.detector.distance, hits.y[hits.detected] / run.detector.distance
         slopes = np.hypot(x, y)
         inside = np.flatnonzero(compression * np.arctan(slopes) < sequence.rim)[:wanted]

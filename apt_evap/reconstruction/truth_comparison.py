@@ -12,7 +12,7 @@ import scipy
 
 from apt_evap._common.codec import for_json
 from apt_evap._common.types import Estimated
-from apt_evap._common.validation import check_choice, check_kind, check_number, check_sequence
+from apt_evap._common.validation import check_choice, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.instrument import Instrument
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.measures.point_cloud import PointCloud
@@ -87,6 +87,41 @@ class TruthComparison:
             for name, row in self.values.items()
         }
         return for_json({"ions": dict(self.ions), "values": values})
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> TruthComparison:
+        """Make a comparison from the results that `to_dict` returned, such as for `corrected`.
+
+        Parameters
+        ----------
+        content : mapping
+            Other entries are left out.
+
+        Returns
+        -------
+        TruthComparison
+
+        Raises
+        ------
+        ValueError
+            If the content is another one.
+        """
+        try:
+            values = {
+                name: {
+                    cloud: Estimated(*(_number(pair[part]) for part in Estimated._fields))
+                    for cloud, pair in row.items()
+                }
+                for name, row in content["values"].items()
+            }
+            return cls(dict(content["ions"]), values)
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"content must be the result of to_dict, got {short_text(content)}") from error
+
+
+def _number(value):
+    """A number of JSON; NaN for None."""
+    return math.nan if value is None else float(value)
 
 
 def compare_with_truth(

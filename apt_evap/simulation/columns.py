@@ -2,7 +2,8 @@
 
 A column has a path, such as "site", "emissions/positions" or "flown/0/times"; a group is a part of the run. Selection
 of ions, joining of batches, the fingerprint and the file follow from this list. A column of the events with the path
-"events/NAME" needs no more than its line here: it is ``run.events["NAME"]``.
+"events/NAME" needs no more than its line here: it is ``run.events["NAME"]``. New columns are in `OPTIONAL`: files of
+earlier versions do not have them.
 """
 
 import hashlib
@@ -142,7 +143,8 @@ def columns_of(run: Any, every: Iterable[Column]) -> dict[str, np.ndarray]:
 
 def events_of(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     """Those columns of the events, by name, that a run keeps under "events"."""
-    names = [column.path.removeprefix("events/") for column in ALWAYS if column.path.startswith("events/")]
+    paths = (column.path for column in (*ALWAYS, *OPTIONAL))
+    names = [path.removeprefix("events/") for path in paths if path.startswith("events/")]
     return {name: columns[name] for name in names}
 
 

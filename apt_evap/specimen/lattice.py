@@ -26,8 +26,8 @@ BASES = {
 }
 """Fractional sites of each structure in its conventional right-angled cell (hcp: a, sqrt(3) a, c)."""
 
-COORDINATION = {"fcc": 12, "bcc": 8, "sc": 6, "diamond": 4, "hcp": 12}
-"""Nearest neighbours in the bulk (hcp: the two shells of six, which fall together at c/a = 1.633)."""
+COORDINATION = {"fcc": (12, 6), "bcc": (8, 6), "sc": (6, 12), "diamond": (4, 12), "hcp": (12, 6)}
+"""Nearest and second neighbours in the bulk (hcp: its two shells of six, equal at c/a = 1.633, are the nearest)."""
 
 BOND_FACTORS = {"fcc": 1.2, "bcc": 1.077, "sc": 1.2, "diamond": 1.3, "hcp": 1.2}
 """Cutoff distance of nearest neighbours, in nearest neighbour distances: half way to the second shell."""

@@ -1,5 +1,6 @@
 """Ranges of the mass-to-charge ratio, which assign species to measured ions."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -7,11 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apt_evap._common.types import Integers
-from apt_evap._common.validation import check_array, check_kind, check_name, check_sequence, did_you_mean, short_text
+from apt_evap._common.validation import (
+    check_array,
+    check_choice,
+    check_kind,
+    check_name,
+    check_sequence,
+    did_you_mean,
+    short_text,
+)
 from apt_evap.detection.hits import Hits
+from apt_evap.specimen.nuclides import ISOTOPES
 from apt_evap.warnings import DataWarning, warn
 
 _MANY = 1 / 3  # of the ions outside every range; measured: 7 % of an oxide on silicon with its own ranges
+
+_HIGHEST = 118  # charge [e]: no atom has more electrons
+_CLOSE = 0.02  # an ion whose isotopes are this far outside its range is another one; peaks have tails of 1 %
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -155,6 +168,32 @@ class Ranges:
         self._warn_of_others(species)
         return names[species]
 
+    def charges(self, hits: Hits, element: str) -> Integers:
+        """Charge of every ion of an element.
+
+        Ranges do not state charges. That of a range is the mass of the element over its centre, rounded: 58.7 Da over
+        29.3 Da is Ni2+. Only ranges of single atoms count: their composition is one atom of the element, or, if they
+        have none, their name is the element, with or without a charge, such as "Ni", "Ni++" or "Ni2+".
+
+        Parameters
+        ----------
+        hits : Hits
+            Ions with mass_to_charge.
+        element : str
+            Chemical symbol.
+
+        Returns
+        -------
+        ndarray of int64, shape (n,)
+            Charge [e]; 0 for an ion in no range of single atoms of the element.
+
+        Raises
+        ------
+        ValueError
+            If no range is of single atoms of the element, or one has none of its isotopes.
+        """
+        return np.array([*self._charges(element), 0])[self.index(hits)]
+
     def count_atoms(self, hits: Hits) -> dict[str, int]:
         """Number of atoms of each element; a molecular ion such as CrO2 counts with all its atoms.
 
@@ -211,6 +250,30 @@ class Ranges:
         self._warn_of_others(species)
         return hits[np.isin(species, [known.index(name) for name in names])]
 
+    def _charges(self, element):
+        """Charge of the ions of each range; 0 for other ions than single atoms of the element."""
+        check_choice(element, "element", ISOTOPES)
+        masses = np.array(ISOTOPES[element])[:, 0]
+        name = re.compile(re.escape(element) + r"(\+*|\^?[1-9]\+)")
+        charges = []
+        for i, (low, high, atoms) in enumerate(zip(self.low, self.high, self.composition, strict=True)):
+            single = atoms == {element: 1} if atoms else name.fullmatch(self.names[i].replace(" ", ""))
+            charge = _nearest_charge(masses, (low + high) / 2) if single else 0
+            if single and not (
+                low < (1 + _CLOSE) * masses.max() / charge and high > (1 - _CLOSE) * masses.min() / charge
+            ):
+                raise ValueError(
+                    f"{self.source or 'ranges'}: {low:g} to {high:g} Da is not a range of {element}, whose isotopes "
+                    f"have {masses.min():.1f} to {masses.max():.1f} Da over the charge"
+                )
+            charges.append(charge)
+        if not any(charges):
+            raise ValueError(
+                f"{self.source or 'ranges'} have no range of single atoms of {element}, only of "
+                f"{', '.join(self.species_names)}"
+            )
+        return charges
+
     def _warn_of_others(self, species):
         outside = int(np.count_nonzero(species < 0))
         if outside > _MANY * len(species):
@@ -236,3 +299,9 @@ class Ranges:
 
     def _text(self, i):
         return f"{self.names[i]} {self.low[i]:g}-{self.high[i]:g}"
+
+
+def _nearest_charge(masses, mass_to_charge):
+    """Charge with which an isotope is nearest to a mass-to-charge ratio [Da]."""
+    charges = np.arange(1, _HIGHEST + 1)
+    return 1 + int(abs(masses[:, None] / charges - mass_to_charge).min(axis=0).argmin())

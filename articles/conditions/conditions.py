@@ -16,8 +16,6 @@ import math
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.evaporation.losses import between_pulses, conditions
-from apt_evap.units import BOLTZMANN
 
 ELEMENTS, SOLUTE = ("Al", "Cu"), 0.1
 LOCAL = 1000  # atoms; more are asked for in a relaxation only
@@ -41,7 +39,7 @@ class Pulsed:
         sensitivities = self.law.sensitivities(tip)[tip.species[atoms]]
         lengths = np.array([self.law.working_point(each, self.control)[1] for each in self.law.sensitivities(tip)])
         x = self.level * fields / tip.evaporation_fields[tip.species[atoms]]
-        stiffness = sensitivities / (BOLTZMANN * self.law.temperature)
+        stiffness = sensitivities / (ae.units.BOLTZMANN * self.law.temperature)
         frequency = self.law.attempt_frequency
         top = frequency * lengths[tip.species[atoms]] * np.exp(np.minimum(-stiffness * (1 - x), 0.0))
         standing = x / (1 + self.control.pulse_fraction)
@@ -114,7 +112,7 @@ def main():
     temperatures, fractions = np.linspace(20.0, 100.0, 41), np.linspace(0.1, 0.3, 21)
     law = ae.Arrhenius(50.0, sensitivity=dict(zip(ELEMENTS, (1.0, 0.6), strict=True)))
     composition = dict(zip(ELEMENTS, (1 - SOLUTE, SOLUTE), strict=True))
-    found = conditions(composition, temperatures=temperatures, pulse_fractions=fractions, law=law)
+    found = ae.evaporation.conditions(composition, temperatures=temperatures, pulse_fractions=fractions, law=law)
     ae.plot.conditions(found, ELEMENTS[1])[0].figure.savefig(options.output, dpi=150)
     for solute, ratio, temperature, fraction in (
         (0.6, 1.0, 50.0, 0.2),
@@ -127,9 +125,9 @@ def main():
         (0.5, 0.8, 50.0, 0.2),
     ):
         sensitivity = dict(zip(ELEMENTS, (1.0, solute), strict=True))
-        law, control = ae.Arrhenius(temperature), ae.evaporation.VoltageControl(pulse_fraction=fraction)
-        ratios = [between_pulses(each, law, control)[0] for each in sensitivity.values()]
-        expected = [each / (1 + each) for each in ratios]
+        law = ae.Arrhenius(temperature, sensitivity=sensitivity)
+        one = ae.evaporation.conditions(composition, temperatures=temperature, pulse_fractions=fraction, law=law)
+        expected = one.lost.ravel()
         found = simulated(sensitivity, ratio, temperature, fraction, options.events, options.seed)
         texts = [
             f"{name} {mean:.2g} +- {error:.1g} ({formula:.2g})"

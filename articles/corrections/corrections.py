@@ -16,8 +16,6 @@ from pathlib import Path
 import numpy as np
 
 import apt_evap as ae
-from apt_evap._common.types import Estimated
-from apt_evap.reconstruction.truth_comparison import TruthComparison, corrected
 
 A = ae.material("Al").a
 R = 16 * A  # nm
@@ -79,11 +77,7 @@ def simulate(first, last):
 def comparison(number):
     """What a specimen was made with, and its comparison."""
     content = json.loads(Path(f"{number}.json").read_text())
-    values = {
-        name: {cloud: Estimated(*(np.nan if x is None else x for x in pair.values())) for cloud, pair in row.items()}
-        for name, row in content["values"].items()
-    }
-    return content, TruthComparison(content["ions"], values)
+    return content, ae.reconstruction.TruthComparison.from_dict(content)
 
 
 def table():
@@ -111,7 +105,7 @@ def row(given, judged, measure, way):
             missing += 1
             continue
         try:
-            value, error = corrected(known, measure, seen, way)
+            value, error = ae.reconstruction.corrected(known, measure, seen, way)
         except ValueError:  # outside what the simulations show
             outside += 1
             continue

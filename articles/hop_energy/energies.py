@@ -24,8 +24,6 @@ from runs import AXES, advanced
 from shares import CHOICES, of_file
 
 import apt_evap as ae
-from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
-from apt_evap.maps.crystallography.directions import poles
 
 PREDICTED = {
     "Ni-001": ((0, 0, 1), 19.0), "Fe-001": ((0, 0, 1), 19.0), "Fe-025": ((0, 2, 5), 23.0), "Fe-112": ((1, 1, 2), 19.0),
@@ -66,8 +64,7 @@ class ByGain:
     def __init__(self, metal, line, part, scale, by_gain=False, less=False):
         self.metal, self.line, self.part, self.scale = metal, line, part, scale
         self.by_gain, self.less = by_gain, less
-        material = ae.material(metal)
-        self.cost = material.cohesive_energy / 2 - EVAPORATION_BARRIER * ae.units.BOLTZMANN * 80.0
+        self.cost = ae.emission.Migration.of(metal, temperature=80.0).cost  # of half the bonds
 
     def gains(self, emissions):
         """G of each ion [eV]; 0 without a neighbour."""
@@ -124,7 +121,7 @@ def judged(metal, radius, run, line):
     """Print the table of one run."""
     scale = float(np.median(run.at_evaporation_field().energy_scales))
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
-    found = poles(orientation.material, 10)
+    found = ae.maps.poles(orientation.material, 10)
     normals = orientation.directions(found.normals)
     series = {}
     for kind, number, rule in rules(metal, line, scale):

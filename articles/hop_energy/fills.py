@@ -19,7 +19,6 @@ from judge import map_of, polar, projection_of
 from predictions import across, lines_about
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.directions import poles
 
 
 def variants(metal, scale, temperature):
@@ -76,7 +75,7 @@ def main():
     run = ae.load(options.run)
     scale = float(np.median(run.at_evaporation_field().energy_scales))
     orientation, projection = ae.Orientation.from_settings(run.settings["tip"]), projection_of(run)
-    found = poles(orientation.material, 10)
+    found = ae.maps.poles(orientation.material, 10)
     labels = np.array(["{" + "".join(str(index) for index in np.sort(np.abs(plane))) + "}" for plane in found.planes])
     normals = orientation.directions(found.normals)
     nearest = orientation.nearest_pole(tuple(options.pole))

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import apt_evap as ae
-from apt_evap.evaporation.bonds import COORDINATION
-from apt_evap.specimen.lattice import BOND_FACTORS
+from apt_evap.specimen.lattice import COORDINATION
 
 AXES = {
     "W": (0, 1, 1), "Ni": (1, 1, 1), "Al": (1, 1, 1), "Cu": (1, 1, 1), "Mg": (0, 0, 0, 1), "Fe": (0, 0, 1),
@@ -96,7 +95,7 @@ class Lattice:
 
     def __init__(self, tip):
         self.tip, self.tree = tip, cKDTree(tip.positions)
-        self.bond = BOND_FACTORS[tip.elements[0].structure] * tip.nearest_neighbour_distance
+        self.bond = tip.bond_length
         self.present = np.ones(len(tip.positions), bool)
         full = COORDINATION[tip.elements[0].structure][0]
         self.steps = []  # to the nearest neighbours; two lists for hcp and diamond

@@ -23,7 +23,6 @@ from judge import map_of, projection_of
 from predictions import across, lines_about
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.directions import poles
 
 PART = 0.04
 """Part of the gain along the surface; of R = 80 a, before larger runs."""
@@ -66,7 +65,7 @@ def part_of(emission, run):
 def shown(run, emissions, pole, projection):
     """Rows of the table about a pole: its name, and a text for each emission."""
     orientation = ae.Orientation.from_settings(run.settings["tip"])
-    lattice = poles(orientation.material, 10)
+    lattice = ae.maps.poles(orientation.material, 10)
     labels = np.array(["{" + "".join(str(index) for index in np.sort(np.abs(plane))) + "}" for plane in lattice.planes])
     normals = orientation.directions(lattice.normals)
     nearest = orientation.nearest_pole(tuple(pole))

@@ -10,7 +10,7 @@ import numpy as np
 from hops import AXES
 
 import apt_evap as ae
-from apt_evap.evaporation.bonds import COORDINATION
+from apt_evap.specimen.lattice import COORDINATION
 
 BARRIER = 28.0  # over kT
 # 1 - (1 + (sqrt(n + 1) - sqrt(n)))/sqrt(z): an atom with one bond to an atom with n = 9 (fcc {111}) or 6 (bcc {110})

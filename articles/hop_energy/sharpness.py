@@ -17,7 +17,6 @@ from energies import AXES, METALS, amplitude, folded, map_of, measured_fold, nam
 from predictions import across
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.directions import poles
 
 SHARPNESSES = (1.0, 0.4, 0.2, 0.1)
 PARTS = (0.06, 0.12, 0.25, 0.5)
@@ -36,7 +35,7 @@ def main():
     projection, orientation = projection_of(run), ae.Orientation.from_settings(run.settings["tip"])
     rule = ae.RollUp.of_metal(options.metal, options.temperature, scale)
     if options.metal == "Mg":
-        lattice, pole = poles(orientation.material, 10), np.array([0.0, 0.0, 1.0])
+        lattice, pole = ae.maps.poles(orientation.material, 10), np.array([0.0, 0.0, 1.0])
         normals = orientation.directions(lattice.normals)
         toward = normals[named(lattice.planes, (0, 1, 3)) & (normals[:, 2] > 0.5)]
     else:

@@ -9,9 +9,9 @@ leave at F_evap (1 - 28 kT/C), C = 1 eV; alpha as selected, and selected again s
 import sys
 
 import numpy as np
+import shares
 
 import apt_evap as ae
-from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
 
 TEMPERATURES = (20.0, 40.0, 60.0, 80.0, 100.0, 150.0, 300.0)  # K
 BARRIER = 1.0  # C, eV
@@ -19,7 +19,7 @@ BARRIER = 1.0  # C, eV
 
 def left_at(temperature):
     """Field at which atoms leave over that of the table."""
-    return 1.0 - EVAPORATION_BARRIER * ae.units.BOLTZMANN * temperature / BARRIER
+    return 1.0 - shares.BARRIER * ae.units.BOLTZMANN * temperature / BARRIER
 
 
 def part(run, metal, temperature, field=1.0, alpha=1.0):

@@ -19,7 +19,6 @@ import scipy
 from matplotlib.colors import LogNorm
 
 import apt_evap as ae
-from apt_evap.simulation import surface_after
 
 RADIUS, SIDE = 16, 15.0  # lattice constants; degrees: ions within this angle from the axis belong to no side
 
@@ -86,7 +85,7 @@ def main():
 
 def draw(run, axes, title, last=60_000):
     """Section of the surface, detector map, and map of the charge states of the last ions."""
-    positions = surface_after(run).positions
+    positions = ae.simulation.surface_after(run).positions
     section = positions[np.abs(positions[:, 1]) < 0.5]
     top = section[:, 2].max()
     axes[0].scatter(section[:, 0], section[:, 2] - top, s=3, color="black")

@@ -21,7 +21,6 @@ import apt_evap as ae
 from apt_evap.detection.microscope.boundary_elements import ChargedPanels, Panels, joined, ring_potential
 from apt_evap.detection.microscope.conductors import electrode, graded
 from apt_evap.detection.microscope.run_lens import RadiusHistory, RunLens
-from apt_evap.units import COULOMB, FLIGHT_TIME, NM_PER_MM
 
 MASS, CHARGE, LENGTH = 58.69, 2, 90.0  # Da, e, mm
 GROWTH = 0.06  # of the panels of the shank
@@ -41,7 +40,7 @@ class Atoms:
     """Point charges [e], whose potential has the unit of the applied voltage."""
 
     def __init__(self, positions, charges, voltage):
-        self.positions, self.charges = positions, charges * COULOMB / voltage
+        self.positions, self.charges = positions, charges * ae.units.COULOMB / voltage
 
     def field(self, places, without):
         """Potential and field at places (n, 3); each ion flies in the field of all atoms but its own."""
@@ -99,12 +98,12 @@ def in_instrument(emitter, lens, cap, cut):
     rings = Rings(joined(shank, electrode(lens.distance, lens.aperture, math.radians(lens.electrode_angle))), cap.apex)
     charges, change = np.full(n, 1e-3), 1.0
     while change > 1e-5:
-        rings.in_presence_of(Atoms(positions, charges, COULOMB))
+        rings.in_presence_of(Atoms(positions, charges, ae.units.COULOMB))
         goal = 1 - rings.field(positions)[0]
         new, _ = scipy.sparse.linalg.cg(matrix, goal.astype(np.float32), charges.astype(np.float32), rtol=3e-6)
         change = float(np.abs(new - charges).max() / np.abs(new).mean())
         charges = new.astype(float)
-    return Atoms(positions, charges, COULOMB), rings, np.flatnonzero(keep)
+    return Atoms(positions, charges, ae.units.COULOMB), rings, np.flatnonzero(keep)
 
 
 def fly(fields, places, lateral, end):
@@ -135,9 +134,9 @@ def on_plane(ends, apex):
     """Distance from the axis over the flight length, azimuth, and time to the plane [nm] of flights."""
     place, velocity, moment, potential, _ = ends
     velocity = velocity * np.sqrt(1 + 2 * potential / (velocity**2).sum(axis=1))[:, None]
-    rest = (LENGTH * NM_PER_MM - place[:, 2] + apex) / velocity[:, 2]
+    rest = (LENGTH * ae.units.NM_PER_MM - place[:, 2] + apex) / velocity[:, 2]
     hit = place + velocity * rest[:, None]
-    return hit[:, :2] / (LENGTH * NM_PER_MM), moment + rest
+    return hit[:, :2] / (LENGTH * ae.units.NM_PER_MM), moment + rest
 
 
 def main():
@@ -198,7 +197,7 @@ def compare(radius, ions, events, cut=0.5, seed=1):
     print(f"flights in the instrument: {ends[-1]} evaluations; {time.process_time() - begin:.0f} s", flush=True)
 
     volts = 1000.0 * np.ones(len(places))
-    unit = FLIGHT_TIME * np.sqrt(MASS / (CHARGE * volts))
+    unit = ae.units.FLIGHT_TIME * np.sqrt(MASS / (CHARGE * volts))
     lengths = np.linalg.norm(free_places, axis=1)
     stereographic = free_places * (np.tan(np.arctan(lengths) / 2) / lengths)[:, None]
     numbers, masses, charges = np.zeros(len(places)), MASS * volts / volts, CHARGE * volts / volts

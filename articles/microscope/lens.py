@@ -12,7 +12,7 @@ import time
 import matplotlib.pyplot as plt
 import numpy as np
 
-from apt_evap.detection.microscope.local_electrode import LocalElectrode
+import apt_evap as ae
 
 ANGLES = (2.0, 5.0, 10.0)
 
@@ -39,7 +39,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="microscope.png", help="the figure")
     options = parser.parse_args()
-    lenses = {angle: LocalElectrode(distance=40e3, aperture=20e3, shank_angle=angle) for angle in ANGLES}
+    lenses = {angle: ae.detection.LocalElectrode(distance=40e3, aperture=20e3, shank_angle=angle) for angle in ANGLES}
     draw(lenses, options.output)
     radii = np.array([20.0, 40.0, 80.0, 160.0])
     for angle, lens in lenses.items():
@@ -59,10 +59,10 @@ def main():
         {"shank_angle": 6.0},
     ):
         start = time.process_time()
-        lens = LocalElectrode(**(base | change)).lens(50.0)
+        lens = ae.detection.LocalElectrode(**(base | change)).lens(50.0)
         found = lens.field_factor, lens.compression
         print(change, "k_f {:.3f} xi {:.3f}".format(*found), f"{time.process_time() - start:.2f} s")
-    plane = LocalElectrode.preset("plane electrode")
+    plane = ae.detection.LocalElectrode.preset("plane electrode")
     print("plane electrode", plane.field_factor(50.0), plane.compression(50.0))
 
 

@@ -21,7 +21,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.orientation import Orientation
 
 TIPS = {
     "W[110]": ("W", (1, 1, 0)),
@@ -72,7 +71,7 @@ def draw(axis, name, run, emission, bins):
     seen = run.on_detector(ae.Detector(distance=100.0, width=160.0, projection="equidistant"))
     counts = seen.hits(emission).map(like=seen.detector.grid(bins), position_step=None)
     ae.plot.detector_map(counts.flattened(25.0).smoothed(1.0), axis, title=name, colorbar=False, caption=False)
-    orientation = Orientation.from_settings(run.settings["tip"])
+    orientation = ae.Orientation.from_settings(run.settings["tip"])
     ae.plot.poles(
         axis, orientation, ae.analysis.image_compression(seen).projection, families=6, zone_families=(), size=7
     )

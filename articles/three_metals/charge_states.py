@@ -20,7 +20,6 @@ from scipy.optimize import brentq
 
 import apt_evap as ae
 from apt_evap._common.codec import from_plain
-from apt_evap.maps.crystallography.directions import poles
 
 HEIGHTS = (0.0, 0.2, 0.4, 0.7, 1.0)  # nm above the start
 NEAR, FIRST = 1.7, 3.0  # degrees: half the width of a strip, and where it begins
@@ -40,7 +39,7 @@ def regions(directions, orientation, metal, near=NEAR, between=None):
     angle = np.degrees(np.arccos(np.clip(directions @ pole, -1, 1)))
     inner, outer = between or (FIRST, METALS[metal].reach)
     inside = (angle > inner) & (angle < outer)
-    found = poles(orientation.material, 10)
+    found = ae.maps.poles(orientation.material, 10)
     strips = []
     for family in CHARGES[metal][2]:
         member = (np.sort(np.abs(found.planes), axis=1) == family).all(axis=1)

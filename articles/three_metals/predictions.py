@@ -21,7 +21,6 @@ from judge import map_of, projection_of
 from runs import prepared
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.directions import poles
 
 FIELD_OF_VIEW = 28.0  # degrees, half angle
 SKIP = 120_000  # atoms that evaporate before the first ion flies, about a third of a layer
@@ -147,7 +146,7 @@ def shown_by(case, paths):
 def judged(name, paths):
     """Print what the maps of a case show: all specimens together, and in brackets each of them."""
     case, shown = CASES[name], shown_by(CASES[name], paths)
-    found = poles(shown.orientation.material, 10)
+    found = ae.maps.poles(shown.orientation.material, 10)
     labels = np.array(["{" + "".join(str(each) for each in np.sort(np.abs(plane))) + "}" for plane in found.planes])
     normals = shown.orientation.directions(found.normals)
     away = np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1)))

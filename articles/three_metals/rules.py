@@ -17,10 +17,6 @@ from judge import METALS, folded, map_of, measured_of, projection_of, row
 from runs import HEIGHT
 
 import apt_evap as ae
-from apt_evap.emission.emissions import TangentialLaunches
-from apt_evap.emission.energies import draw_energies
-from apt_evap.emission.roll_probability import EVAPORATION_BARRIER
-from apt_evap.units import speed_from_energy
 
 STEP = 0.01
 """Width of the threshold of a charge ratio."""
@@ -34,13 +30,10 @@ def laws(name):
     """Thresholds of laws of rolling for a metal, each with its one constant from tungsten: threshold 0.66."""
     tungsten, metal = (ae.emission.Migration.of(each) for each in ("W", name))
 
-    def cost(law):  # of the hop, less the barrier of evaporation
-        return law.bonds_lost * law.cohesive_energy - EVAPORATION_BARRIER * ae.units.BOLTZMANN * law.temperature
-
     def threshold(start, slope, tungsten_atom=1.0, metal_atom=1.0):
         """The line of `migration.py`, and the polarisabilities of the atoms; that of tungsten fixes their unit."""
         gained = (start + slope * tungsten.threshold) ** 2 - 1.0
-        gained *= cost(metal) / cost(tungsten) * tungsten.field**2 * tungsten_atom / (metal.field**2 * metal_atom)
+        gained *= metal.cost / tungsten.cost * tungsten.field**2 * tungsten_atom / (metal.field**2 * metal_atom)
         return ((gained + 1.0) ** 0.5 - start) / slope
 
     return {
@@ -67,9 +60,9 @@ class Pushed:
     def tangential(self, emissions, random):
         """See `Combined.tangential`."""
         there, first, second = ae.emission.rollup_direction(emissions)
-        speed = speed_from_energy(draw_energies(self.energy, random.uniform(1)[:, 0]), emissions.masses)
+        speed = ae.units.speed_from_energy(self.energy.quantile(random.uniform(1)[:, 0]), emissions.masses)
         heights = np.full(len(there), self.height)
-        return TangentialLaunches(np.zeros_like(there), -speed * first, -speed * second, None, heights)
+        return ae.emission.TangentialLaunches(np.zeros_like(there), -speed * first, -speed * second, None, heights)
 
 
 class Bridge:

@@ -1,5 +1,7 @@
 """The specimen that a reconstruction has found, and the comparison of its simulation with the measurement."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from fluxes import even_flux
@@ -7,7 +9,7 @@ from fluxes import even_flux
 import apt_evap as ae
 from apt_evap.reconstruction.beyond_view import Feature
 from apt_evap.reconstruction.found_region import FoundRegion
-from apt_evap.reconstruction.specimen_check import _compared, _densities
+from apt_evap.reconstruction.specimen_check import _compared, _densities, _simulated
 from apt_evap.specimen.regions import contains
 
 KNOWN = {"element": "Al", "efficiency": 0.5, "distance": 100.0, "projection": "compressed", "compression": 1.0}
@@ -75,3 +77,16 @@ def test_the_specimen_has_the_phases_and_fields_that_were_found():
     plain = ae.reconstruct(hits, shape="evolving", radius=13.0, **KNOWN)
     with pytest.raises(ValueError, match="must have found evaporation fields by voltage and phases, got 'followed"):
         plain.specimen()
+
+
+@pytest.mark.slow
+def test_as_many_simulated_ions_as_the_measured_part_has_atoms():
+    matrix = ae.specimen.Phase("matrix", "Ni")
+    tip = ae.Tip(phases=[matrix], apex_radius=2.5, axis=(1, 1, 1), seed=1)
+    # 400 ions of the measurement, each the volume of an atom of nickel, at the scale of the simulation
+    sequence = SimpleNamespace(directions=np.zeros((400, 3)), volume=0.352**3 / 4, radius=2.5, rim=0.6)
+    places, again = _simulated([tip, tip], sequence)
+    assert len(places) in (399, 400) and np.hypot(*places.T).max() < np.sin(0.6)
+    np.testing.assert_array_equal(places, again)
+    # at rest ions spread over the cap: half of them beyond half of the area of its image
+    assert np.mean(np.hypot(*places.T) > np.sin(0.6) / np.sqrt(2)) == pytest.approx(0.5, abs=0.15)

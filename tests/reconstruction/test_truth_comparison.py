@@ -1,5 +1,6 @@
 """A measure of all sites, of detected ions and of reconstructions, and the correction that follows."""
 
+import json
 import math
 
 import numpy as np
@@ -39,7 +40,13 @@ def test_detection_and_trajectories_are_two_losses(run):
     assert z["cap"].value == pytest.approx(z["detected"].value, abs=1e-9) and math.isnan(z["cap"].error)
     assert compared.loss_to_trajectories("width") != 0.0
     assert compared.table().splitlines()[0].split() == ["all", "sites", "detected", "cap"]
-    assert compared.to_dict()["values"]["z"]["cap"]["error"] is None
+    kept = json.loads(json.dumps(compared.to_dict()))
+    assert kept["values"]["z"]["cap"]["error"] is None
+    again = ae.reconstruction.TruthComparison.from_dict(kept)
+    assert again.table() == compared.table() and again.to_dict() == kept
+    for wrong in (kept["values"], [], kept | {"values": {"z": {"cap": {"value": 1.0}}}}):
+        with pytest.raises(ValueError, match="content must be the result of to_dict, got"):
+            ae.reconstruction.TruthComparison.from_dict(wrong)
     assert len(ae.plot.truth_comparison(compared, title="three ways")) == 3
 
 

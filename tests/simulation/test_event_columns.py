@@ -10,9 +10,9 @@ from apt_evap.simulation import columns, run_hdf5
 @pytest.fixture
 def run_with_rises(small_tip, monkeypatch):
     """A run that stores "rises", which the events of a control contain and a run does not keep."""
-    with_rises = (*columns.ALWAYS, columns._of_events("events/rises"))
+    with_rises = (*columns.OPTIONAL, columns._of_events("events/rises"))
     for module in (columns, run_hdf5):
-        monkeypatch.setattr(module, "ALWAYS", with_rises)
+        monkeypatch.setattr(module, "OPTIONAL", with_rises)
     return ae.Simulation(small_tip, seed=1, law=ae.Arrhenius(60.0)).run(
         300, [ae.Unperturbed()], responses=False, progress=False
     )
@@ -29,6 +29,17 @@ def test_a_column_of_the_events_is_stored_by_one_line(run_with_rises, tmp_path):
     assert np.array_equal(loaded.events["rises"], rises) and loaded.fingerprint() == run.fingerprint()
     rises[7] += 1.0
     assert loaded.fingerprint() != run.fingerprint()
+
+
+def test_files_without_a_new_column_stay_readable(run_with_rises, small_tip, monkeypatch, tmp_path):
+    kept = columns.OPTIONAL
+    with monkeypatch.context() as earlier:
+        for module in (columns, run_hdf5):
+            earlier.setattr(module, "OPTIONAL", kept[:-1])
+        run = ae.Simulation(small_tip, seed=1).run(20, progress=False)
+        run.save(tmp_path / "earlier.h5")
+    loaded = ae.load(tmp_path / "earlier.h5")
+    assert loaded.events == loaded[3:9].events == {} and loaded.fingerprint() == run.fingerprint()
 
 
 def test_other_columns_of_the_events_are_not_kept(small_tip):

@@ -38,6 +38,13 @@ def test_text_and_python_are_read_back(perturbation, text, python):
     assert eval(python, {"ae": ae}) == perturbation
 
 
+def test_a_class_of_ones_own_is_for_settings_files():
+    with pytest.raises(ValueError, match="'mine:Along': a class of one's own is imported only for the file that"):
+        read_perturbation('{name = "mine:Along", energy = 0.2}')
+    with pytest.raises(ValueError, match="energy 'mine:Uniform': a class of one's own"):
+        read_perturbation('{name = "RollUp", energy = {name = "mine:Uniform"}}')
+
+
 @pytest.mark.parametrize(
     ("perturbation", "title"),
     [

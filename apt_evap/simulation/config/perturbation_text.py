@@ -7,6 +7,7 @@ from apt_evap._common.codec import declared, is_settings, to_plain, to_python
 from apt_evap._common.validation import short_text
 from apt_evap.emission.energies import Thermal, TruncatedNormal
 from apt_evap.emission.perturbations import Perturbation, perturbation_of
+from apt_evap.simulation.config.own_classes import with_own_objects
 from apt_evap.simulation.config.toml_text import inline, read_toml
 
 
@@ -36,7 +37,7 @@ def _perturbation_table(text):
         table, *further = read_toml(f"perturbation = {text}").values()
         if further:
             raise ValueError("expected one table in one line")
-        return table
+        return with_own_objects({"perturbation": table}, None)["perturbation"]  # none here, says its error
     name, colon, numbers = text.partition(":")
     if not colon:
         return {"name": name}
