@@ -73,6 +73,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--labels", metavar="COLUMN", help="a column of the ions with the number of their phase, in place of --solutes"
     )
     surface.add_argument(
+        "--twin",
+        metavar="RUN.h5",
+        help="a run of the matrix alone, in the same orientation, whose mean errors are taken off an evolving shape",
+    )
+    surface.add_argument(
         "--check",
         nargs="?",
         const=(),
@@ -234,9 +239,14 @@ def _extent(options, hits):
 
 def _surface(options, hits, ranges):
     """Arguments of `reconstruct` for the surface."""
-    if options.shape == "cap" and (options.solutes or options.labels):
-        raise ValueError(f"--{'solutes' if options.solutes else 'labels'} needs --shape evolving, got --shape cap")
+    from apt_evap.simulation.run import load
+
+    for name in ("solutes", "labels", "twin"):
+        if options.shape == "cap" and getattr(options, name):
+            raise ValueError(f"--{name} needs --shape evolving, got --shape cap")
     arguments = {"shape": options.shape, "ranges": ranges}
+    if options.twin:
+        arguments["twin"] = load(options.twin)
     if options.solutes:
         arguments["solutes"] = tuple(options.solutes.split(","))
     if options.labels:

@@ -34,7 +34,9 @@ from apt_evap.reconstruction.local_composition import (
 )
 from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruction
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings, slope_of_shank
+from apt_evap.reconstruction.twin_correction import TwinErrors
 from apt_evap.reconstruction.voltage_course import smoothed, without_jumps
+from apt_evap.simulation.run import Run
 from apt_evap.specimen.materials import Material, as_material
 from apt_evap.specimen.tip import Tip
 
@@ -213,6 +215,8 @@ class EvolvingReconstruction(Reconstruction):
     """What `again` needs: what was measured, and what was kept fixed."""
     _cap_radii: Floats | None = field(default=None, repr=False)
     """Radii of the cap [nm], for `cap_positions`."""
+    twin_errors: TwinErrors | None = field(default=None, repr=False)
+    """Errors of the twin by whose means the positions are corrected; None without one, or if it was refused."""
 
     _has_free_projection: ClassVar[bool] = False
 
@@ -399,6 +403,7 @@ def follow_surface(
     ranges: MassRanges | None = None,
     solutes: Sequence[str] = (),
     labels: ArrayLike | None = None,
+    twin: Run | None = None,
 ) -> EvolvingReconstruction:
     """Reconstruct ions by a surface that follows them, with resolved settings, see `reconstruct`."""
     if settings.protocol != "cap":
@@ -421,7 +426,8 @@ def follow_surface(
     fixed = _fixed_point(thinned)
     if isinstance(fixed, str):
         return _as_cap(cap, fixed + (f" ({why})" if why else ""))
-    return _placed(cap, measured, fixed, every, why, thinned)
+    found = _placed(cap, measured, fixed, every, why, thinned)
+    return found if twin is None else _corrected(found, TwinErrors.of(twin, rim), ions.directions)
 
 
 def _check_sequence(hits):
@@ -747,6 +753,18 @@ def _placed(cap, measured, fixed, every, why, thinned):
         verdict=_verdict(fixed, measured, why), apex_depths=found.apex_depths, ion_fields=thresholds,
         _followed=(thinned, fixed), _cap_radii=cap.radii,
     )  # fmt: skip
+
+
+def _corrected(found, twin, directions):
+    """The reconstruction without the mean errors of the twin, unless its density does not describe the measured one."""
+    gain = twin.gain(directions)
+    said = f"; the twin {{}}, its density at the ions is {math.exp(gain):.3f} of an even one"
+    if gain <= 0:
+        return replace(found, verdict=found.verdict + said.format("is not used"))
+    shifts = twin.shifts_at(directions, found.radii) * (1.0, 1.0, -1.0)  # depth in place of z
+    return replace(
+        found, positions=found.positions + shifts, twin_errors=twin, verdict=found.verdict + said.format("is used")
+    )
 
 
 def _verdict(fixed, measured, why):

@@ -14,6 +14,7 @@ from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
 from apt_evap.reconstruction.evolving_surface import IonSequence
+from apt_evap.reconstruction.twin_correction import without_means
 
 CONSTANT_ERRORS: Mapping[str, float] = {"compression": 0.05, "radius": 0.05, "efficiency": 0.05}
 """Relative standard errors of the constants where none are given."""
@@ -27,7 +28,7 @@ _CLOSE, _NEAR = 4, 24  # neighbours over which corrections of halves, and their 
 def position_covariances(
     reconstruction: EvolvingReconstruction,
     constant_errors: Mapping[str, float] | None = None,
-    local: Sequence[float] = LOCAL_SCATTER,
+    local: Sequence[float] | None = None,
 ) -> Floats:
     """Covariance of the position of each ion.
 
@@ -37,9 +38,10 @@ def position_covariances(
         A reconstruction whose surface was followed.
     constant_errors : mapping, optional
         Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
-    local : sequence of float
+    local : sequence of float, optional
         Scatter of the ions about their neighbours along the surface and across it [nm], such as `local_scatter` of a
-        simulated specimen of the same matrix.
+        simulated specimen of the same matrix. By default what the mean errors of the twin leave, with half of them
+        in doubt, if the reconstruction was corrected by one, else `LOCAL_SCATTER`.
 
     Returns
     -------
@@ -67,6 +69,9 @@ def position_covariances(
     ions = reconstruction.sequence
     usual = reconstruction.again(ions)
     sphere = ions.radius * ions.directions - np.array([0, 0, 1]) * ions.depths[1:, None]
+    if local is None:
+        twin = reconstruction.twin_errors
+        local = LOCAL_SCATTER if twin is None else twin.scatter(float(np.median(reconstruction.radii)))
     total = local_covariances(ions, local)
     corrections = []
     for first in (0, 1):
@@ -132,8 +137,7 @@ def local_scatter(reconstruction: EvolvingReconstruction, sites: ArrayLike) -> t
     true = check_array(sites, "sites", (len(reconstruction), 3))
     errors = reconstruction.specimen_positions - true
     # the mean of a block is an error of the recession, which the constants and the halves account for
-    blocks = np.array_split(errors, _BLOCKS)
-    left = np.concatenate([block - block.mean(axis=0) for block in blocks if len(block)])
+    left = without_means(errors, _BLOCKS)
     places, angles = reconstruction.geometry.places(reconstruction.hits, reconstruction.radii)
     across = np.einsum("ni,ni->n", left, np.column_stack([places, np.cos(angles)]))
     along = ((left**2).sum(axis=1) - across**2) / 2

@@ -13,6 +13,7 @@ from apt_evap.reconstruction.evolving import follow_surface
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.reconstructed import Reconstruction, cap_reconstruction
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings, resolved_settings
+from apt_evap.simulation.run import Run
 
 SHAPES = ("cap", "evolving")
 """Surfaces: a sphere, or the shape that is integrated from the ions."""
@@ -27,6 +28,7 @@ def reconstruct(
     solutes: Sequence[str] = (),
     labels: ArrayLike | None = None,
     origins: OriginTable | None = None,
+    twin: Run | None = None,
     **constants: Any,
 ) -> Reconstruction:
     r"""Reconstruct the positions of ions from their hits.
@@ -49,6 +51,10 @@ def reconstruct(
     origins : OriginTable, optional
         Table of where the ions of simulated hits came from. Lateral positions are corrected by it, and get covariances.
         The hits must have the axes of the simulated specimen.
+    twin : Run, optional
+        Simulated run of the matrix alone, in the orientation and with the emission of the measurement, for an evolving
+        shape. The mean errors of its reconstruction at the place of each ion are taken off, if its density on the
+        detector describes the measured one better than an even one does: the verdict says so.
     **constants
         Fields of `ReconstructionSettings` by name, instead of the object, or to replace some of its fields.
 
@@ -102,12 +108,16 @@ def reconstruct(
         check_kind(ranges, "ranges", "species", "Ranges, such as ae.io.read_ranges(path)")
     if origins is not None:
         check_kind(origins, "origins", OriginTable, "an OriginTable, such as origin_table(runs)")
+    if twin is not None:
+        check_kind(twin, "twin", Run, "a Run, such as ae.load(path)")
     chosen = check_choice(shape, "shape", SHAPES)
     if chosen == "cap":
         for name, value in (("solutes", solutes), ("labels", labels)):
             if value is not None and not (isinstance(value, tuple | list) and not value):
                 raise ValueError(f'{name} are for shape="evolving", got {short_text(value)} and shape="cap"')
+        if twin is not None:
+            raise ValueError('twin is for shape="evolving", got a run and shape="cap", for which origins are')
         return cap_reconstruction(hits, resolved_settings(settings, constants), origins)[0]
     if origins is not None:
         raise ValueError('origins must be None with shape="evolving", whose positions a table of a sphere would move')
-    return follow_surface(hits, resolved_settings(settings, constants), ranges, solutes, labels)
+    return follow_surface(hits, resolved_settings(settings, constants), ranges, solutes, labels, twin)

@@ -6,7 +6,7 @@ Specimens of aluminium with phases of other evaporation fields, evaporated at a 
 sees of them. Each run is one file ``NAME_SEED.npz`` with the sites, phases and species of all atoms in sequence, their
 landing places, and the voltage at which each site would have left. A run of R = 12 nm takes 3.1 to 3.3 minutes of
 processor time on an EPYC. ``python runs.py NAME:SEED ... -o FOLDER`` makes those that the folder does not have;
-``NAME:1-5`` are five seeds. Without names, the list of all.
+``NAME:1-5`` are five seeds. Without names, the list of all. ``twin.h5`` is a run of the matrix alone, R = 6 nm.
 """
 
 import argparse
@@ -119,12 +119,23 @@ def evaporate(name, seed, folder):
     np.savez(folder / f"{name}_{seed}.npz", **kept)
 
 
+def twin(folder):
+    """A smaller specimen of the matrix alone, whose errors are those of the emission and the lattice."""
+    tip = ae.Tip("Al", apex_radius=6.0, axis=(0, 1, 2), shank_angle=1.5, shank_length=12.0, depth=11.4,
+                 offset_seed=301, seed=301)  # fmt: skip
+    simulation = ae.Simulation(tip, seed=301, rule=ae.ConstantPotential(), n_threads=1)
+    run = simulation.run(int(8.4 * np.pi * 6**2 / VOLUME), [ae.Unperturbed()], responses=False, progress=False)
+    run.save(folder / "twin.h5")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", metavar="NAME:SEEDS", help=f"default: {' '.join(CASES)}")
     parser.add_argument("-o", "--output", type=Path, default=Path("runs"), help="folder; default: runs")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
+    if not (options.output / "twin.h5").exists():
+        twin(options.output)
     for text in options.cases or CASES:
         name, seeds = text.split(":")
         first, _, last = seeds.partition("-")

@@ -150,8 +150,8 @@ def ways_of(base, emission, regions):
     return ways
 
 
-def compare(path, emission="rest", chosen=None):
-    """One case by all methods, or by some: rows of the table."""
+def compare(path, emission="rest", chosen=None, twin=None):
+    """One case by all methods, or by some, and with a twin: rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
     base = name.split("-")[0]
     phases, shank, _, apex = runs.case(name)
@@ -185,6 +185,11 @@ def compare(path, emission="rest", chosen=None):
         if emission == "rest" and found.history is not None and way in ("labels", "ring"):
             row["coverage"] = coverage(found, sites, EXACT)
         rows[way] = row
+        if twin is not None and way in ("labels", "ring"):
+            found = reconstructed(hits, shape="evolving", twin=twin, **growth, **how)
+            rows[f"{way}, twin"] = row = measured(found, sites, phase, regions) | {"verdict": found.verdict}
+            if found.history is not None:
+                row["coverage"] = coverage(found, sites, EXACT)
     true = PHASE_FIELDS.get(base, [])
     return {"name": path.stem + ("" if emission == "rest" else f" ({emission})"), "true": true, "rows": rows}
 
@@ -278,7 +283,11 @@ def main():
     parser.add_argument("-o", "--output", type=Path, default=Path(), help="folder of table and picture")
     parser.add_argument("--only", nargs="*", metavar="NAME_SEED", help="cases; default: all, and the picture")
     parser.add_argument("--ways", nargs="*", metavar="METHOD", help="methods beside the cap; default: all")
+    parser.add_argument(
+        "--twin", type=Path, metavar="RUN.h5", help="run of the matrix alone, for more rows; default: none"
+    )
     options = parser.parse_args()
+    twin = None if options.twin is None else ae.load(options.twin)
     kept = options.output / "cases.json"
     cases = json.loads(kept.read_text()) if options.only and kept.exists() else {}
     paths = sorted(options.input.glob("*.npz"))
@@ -286,7 +295,7 @@ def main():
         if options.only and path.stem not in options.only:
             continue
         for emission in ("rest", "metal", "all") if "-rolled" in path.stem else ("rest",):
-            case = compare(path, emission, options.ways)
+            case = compare(path, emission, options.ways, twin)
             cases[case["name"]] = case
             for row, verdict in lines_of(case):
                 print(" | ".join(row), "|", verdict, flush=True)

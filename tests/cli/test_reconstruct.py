@@ -100,6 +100,8 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
         ("--distance 90 --element Ni --smoothing 1.5", "--smoothing: must be an integer >= 1, got '1.5'"),
         ("--distance 90 --element Ni --shank-angle 45", "shank_angle must be a finite number [degrees] >= 0"),
         ("--distance 90 --element Ni --check", "--check needs --shape evolving and --element, got --shape cap"),
+        ("--distance 90 --element Ni --twin ni.h5", "--twin needs --shape evolving, got --shape cap"),
+        ("--distance 90 --element Ni --shape evolving --twin ni.h5", "'ni.h5'"),
         ("--distance 90 --element Ni --shape evolving --check 0,1", "--check: axis must be three numbers such as"),
         ("--distance 90 --element Ni --shape evolving --check up", "--check: must be numbers separated by commas"),
     ],
