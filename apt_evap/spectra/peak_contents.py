@@ -24,6 +24,9 @@ _SMALL = 0.03  # height over its own of a peak that does not count
 _BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
 _NEIGHBOURS = 0.10  # relative error of the tails of other peaks below a peak
 _ROUNDS, _ITERATIONS = 3, 120
+_FLANK = 0.1
+_SHOULDER, _SHOULDER_APART, _FEWEST_SHOULDER = 4.0, 2.5, 60.0
+_SEARCHES, _STEPS = 2, 6
 CORE = 2 * BINS
 """Half width of the core of a peak [bins]: the error of its content is that of the counts there."""
 
@@ -74,6 +77,9 @@ class PeakContents:
         self._smooth_background = _background_basis(self.scale)
         self._mixture = np.array([*_MIXTURE[0][: len(self._tails)], *_MIXTURE[1]])
         self._start: Floats | None = None  # amplitudes of the background of the last fit
+        if len(self.places):
+            self.places = self._with_shoulders(self.places)
+            self.seen_at = self.scale.mass(self.places)
 
     def fit(self, expected: Floats | None = None) -> Contents:
         """Numbers of ions at the peaks, and at further places where ions are expected [Da]."""
@@ -103,6 +109,64 @@ class PeakContents:
         shapes = np.where(strong[:, None], shares, mixture) @ self._bases
         return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes,
                         np.convolve(self.counts, np.ones(2 * CORE + 1), "same"))  # fmt: skip
+
+    def _with_shoulders(self, places):
+        """Places of peaks [bins], and of those in their flanks and tails: where more ions are than the others have.
+
+        All peaks have the mean shape here: one with tails of its own would have the ions of a shoulder in them.
+        """
+        mixture = self._mixture / self._mixture.sum()
+        for _ in range(_SEARCHES):
+            height = self._smooth[np.rint(places).astype(int)]
+            near = np.array([height[np.abs(places - centre) < 60 * BINS].max() for centre in places])
+            strong = (height > 0.03 * near) & (height * BINS * 2.5 > _STRONG)
+            if not strong.any():
+                return places
+            common = np.ones(int(strong.sum()), bool)
+            for _ in range(2):
+                ions, shares, below = self._maximise(places, height, strong, common, mixture, _ITERATIONS // 3)
+                mixture = np.maximum(shares[strong].mean(0), 1e-4)
+                mixture /= mixture.sum()
+            found = self._places_of_more(places, ions, below, mixture)
+            if not len(found):
+                return places
+            places = self._moved(np.append(places, found), np.arange(len(places) + len(found)) >= len(places), mixture)
+        return places
+
+    def _places_of_more(self, places, ions, below, mixture):
+        """Places [bins] where the histogram has more ions than peaks of a shape and a background."""
+        from scipy.ndimage import gaussian_filter1d
+        from scipy.signal import find_peaks
+
+        model = self.columns(places, np.tile(mixture @ self._bases, (len(places), 1))) @ ions
+        peaks, expected = gaussian_filter1d(model, BINS), gaussian_filter1d(model + below, BINS)
+        more = self._smooth - expected
+        wide = 2 * math.sqrt(math.pi) * BINS  # bins that are effectively in the filter
+        error = np.sqrt(expected / wide + (_FLANK * peaks) ** 2 + (_FLANK * BINS * np.gradient(peaks)) ** 2 + 0.1)
+        tops, _ = find_peaks(more / error, height=_SHOULDER)
+        apart = np.abs(tops[:, None] - places).min(1) > _SHOULDER_APART * BINS
+        heavy = self.scale.mass(tops) > LIGHT
+        return tops[apart & heavy & (more[tops] * wide > _FEWEST_SHOULDER)].astype(float)
+
+    def _moved(self, places, new, mixture):
+        """Places of peaks [bins], new ones and their neighbours at the best likelihood; those that vanish left out."""
+        first, shape = places.copy(), mixture @ self._bases
+        moved = np.abs(places[:, None] - places[new]).min(1) < 6 * BINS
+        none = np.zeros(len(places), bool)
+        for _ in range(_STEPS):
+            height = self._smooth[np.clip(np.rint(places).astype(int), 0, self.scale.size - 1)]
+            ions, _, below = self._maximise(places, height, none, none[:0], mixture, 30)
+            shapes = np.tile(shape, (len(places), 1))
+            model = self.columns(places, shapes) @ ions + below + 1e-3
+            slope = self.columns(places + 0.5, shapes) - self.columns(places - 0.5, shapes)
+            step = (slope.T @ (self.counts / model - 1)) / np.maximum(slope.power(2).T @ (1 / model) * ions, 1e-9)
+            places = places + np.where(moved, np.clip(step, -0.5 * BINS, 0.5 * BINS), 0)
+            places = first + np.clip(places - first, -2 * BINS, 2 * BINS)
+        order = np.argsort(places)
+        near = np.diff(places[order], prepend=-np.inf) < 1.5 * BINS
+        lost = np.zeros(len(places), bool)
+        lost[order] = near
+        return np.sort(places[~(lost & new) & ~(new & (ions < _FEWEST_SHOULDER))])
 
     def _maximise(self, place, height, strong, common, mixture, iterations):
         """Ions and shares of the tails of each peak, and the background, by expectation and maximisation."""
