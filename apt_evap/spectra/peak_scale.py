@@ -27,7 +27,8 @@ specimens that it was chosen on; of 200 others 99 % have less than 1.43, and one
 _FARTHEST = 500  # steps to the half height of one
 _SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
-_APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
+APART = 2.0
+"""Standard deviations between two peaks; of nearer ones the higher is kept."""
 
 
 class PeakScale:
@@ -195,7 +196,7 @@ def find_places(counts: Floats) -> tuple[Floats, Floats]:
     tops, _ = find_peaks(2 * np.sqrt(smooth * 2 * math.sqrt(math.pi) * BINS + 0.375), prominence=_PROMINENCE)
     kept: list[int] = []
     for top in tops.tolist():
-        if kept and top - kept[-1] < _APART * BINS:
+        if kept and top - kept[-1] < APART * BINS:
             if smooth[top] > smooth[kept[-1]]:
                 kept[-1] = top
             continue
