@@ -176,6 +176,13 @@ def test_charges_of_the_made_ions_are_counted():
     assert {"C₂⁺", "C²⁺", "C₃²⁺"} <= {ion.name for ion in result.ions}
 
 
+def test_no_more_than_all_ions_are_unexplained():
+    """Nitrogen is named at 15 Da, and most of it is missing at 14 Da: there and here 168 % of the ions."""
+    hits = made({("Si", 2): 5, ("Si", 1): 1}, 36_000, isotopes={"Si": {28: 0.01, 30: 0.99}})
+    result = ae.spectrum(hits)
+    assert result.unexplained_part == 1 and "100.0% of the ions in peaks are unexplained" in result.composition.refused
+
+
 @pytest.mark.slow
 def test_an_unexplained_spectrum_has_no_composition():
     """Silicon of two equal isotopes is no element of the table, until its abundances are given."""

@@ -40,3 +40,11 @@ def test_a_peak_in_the_flank_of_another_is_found(rng, distance):
     weak, main = (int(np.argmin(np.abs(contents.mass - m))) for m in (float(peaks.scale.mass(new)), 90.0))
     assert contents.ions[weak] == pytest.approx(10_000, rel=0.1)
     assert np.log(contents.mass[weak] / contents.mass[main]) / 8e-4 == pytest.approx(distance, abs=0.4)
+
+
+def test_the_shape_of_weak_peaks_and_of_hydrogen_brings_no_peaks(rng):
+    """700 ions at 90 Da and 10,000 at 1 Da with half as many beside them: weak peaks, or hydrogen, of another shape."""
+    strong = dict.fromkeys((13.0, 27.0, 58.0, 102.0), 100_000)
+    double = {90.0: 500, 90.0 * (1 - 3.5 * 8e-4): 200, 1.008: 10_000, 1.008 * (1 - 3.5 * 8e-4): 5000}
+    peaks = PeakContents(drawn(rng, strong | double))
+    assert len(peaks.places) == len(find_places(peaks.counts)[0])
