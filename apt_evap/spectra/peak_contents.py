@@ -18,16 +18,24 @@ _LONGEST = 0.014  # of ln m/n at 30 Da: longer tails are not of one peak
 _TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
 _MIXTURE = ((0.4, 0.25, 0.15, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
 _STRONG = 3000  # ions of a peak that has a mixture of tails of its own
-_STRONG_LIGHT = 200  # of a light peak whose width is not that of the others
+_STRONG_LIGHT = 200
+"""The same of a light peak whose width is not that of the others. Of 96 made peaks of hydrogen two to eight times as
+broad as the others 80 % have errors below 0.92, 0.83 and 0.83 % for 100, 200 and 400 (seed 202706)."""
 _ALONE = 12.0  # standard deviations to the next peaks, for tails of its own
 _SMALL = 0.03  # height over its own of a peak that does not count
 _BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
 _NEIGHBOURS = 0.10  # relative error of the tails of other peaks below a peak
 _ROUNDS, _ITERATIONS = 3, 120
-_FLANK = 0.1  # relative error of the shape of a peak and of its place [standard deviations], for shoulders
-_SHOULDER, _FEWEST = 4.0, 60.0  # errors by which there are more ions, and ions of a shoulder
+_FLANK = 0.1
+"""Relative error of the shape of a peak, and of its place in standard deviations, for shoulders: 48 of the new peaks of
+`_SHOULDER` are lines and 8 are not with 0.05, 26 and 3 with 0.2."""
+_SHOULDER, _FEWEST = 4.0, 60.0
+"""Errors by which there are more ions, and ions of a shoulder. Of the new peaks in 40 made spectra (seed 202701),
+beside 3,000 ions or more, 38 are lines and 3 are not; 41 and 6 with 3 errors, 32 and 3 with 5; 40 and 4 with 30 ions,
+38 and 3 with 120."""
 _APART_MOVED = 1.5  # standard deviations between a shoulder and another peak at their best places
-_PLAIN = 1000  # ions of a peak that may have shoulders
+_PLAIN = 1000
+"""Ions of a peak that may have shoulders: with 300 a spectrum of silicon has other names, SiO+ is CO2+."""
 _SEARCHES, _STEPS = 2, 6  # for shoulders, and of their places towards the best ones
 CORE = 2 * BINS
 """Half width of the core of a peak [bins]: the error of its content is that of the counts there."""

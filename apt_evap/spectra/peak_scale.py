@@ -24,7 +24,9 @@ _NOMINAL = 5e-4  # width without a peak
 _OWN = 1.5
 """Times the common width, from which light peaks have their own. Where it is one: up to 1.45 in the 200 random
 specimens that it was chosen on; of 200 others 99 % have less than 1.43, and one has 1.54."""
-_FARTHEST = 500  # steps to the half height of one
+_FARTHEST = 500
+"""Steps to the half height of one. Of 96 made peaks of hydrogen, two to eight times as broad as the others, 95 % have
+errors below 3.5 %, and below 8 % with 250 steps (seed 202706)."""
 _SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
 APART = 2.0
