@@ -476,17 +476,14 @@ class Explainer:
 
     def _with_perhaps(self, choice, kept, amplitudes, perhaps):
         """Atomic ions of each element that has too few lines to be counted, and chi-squared and costs with them."""
-        banned = choice.banned
         for name in sorted(perhaps):
-            choice.banned = banned - {name}
-            tried = choice.candidates(kept, amplitudes)
+            tried = choice.candidates(kept, amplitudes, also=name)
             more = tried[choice.atoms[tried, choice.elements.index(name)] == choice.atoms[tried].sum(1)].tolist()
             held = choice.fit.solve([*kept, *more])[0][len(kept) :] >= choice.least
             more = [number for number, enough in zip(more, held, strict=True) if enough]
             if more:
                 chi2 = choice.fit.solve([*kept, *more])[1]
                 yield more, chi2 + choice.cost([*kept, *more])
-        choice.banned = banned
 
     def _in_one_peak(self, fit, kept):
         """Hydrides whose lines are in one broad peak with those of the ion without hydrogen, and these ions."""

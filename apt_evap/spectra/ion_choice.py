@@ -163,23 +163,29 @@ class IonChoice:
         counted = (self._atomic[numbers] >= 0)[:, None] | self._gas
         self._share = (atoms * counted).sum(0) / max(float(atoms.sum()), 1e-9)
 
-    def candidates(self, chosen: Sequence[int], amplitudes: Floats, every: bool = False) -> Rows:
-        """Numbers of the ions that are tried beside some ions; only these that have peaks, unless every one."""
+    def candidates(
+        self, chosen: Sequence[int], amplitudes: Floats, every: bool = False, also: str | None = None
+    ) -> Rows:
+        """Numbers of the ions that are tried beside some ions; only these that have peaks, unless every one.
+
+        `also` is an element that is tried here although it is banned.
+        """
+        banned = self.banned - {also}
         numbers = np.asarray(chosen, int)
         atomic = self._atomic[numbers] if len(numbers) else np.zeros(0, int)
         content = np.bincount(np.maximum(atomic, 0), np.asarray(amplitudes) * (atomic >= 0), len(self.elements))
         part = content / max(float(np.sum(amplitudes)), 1e-9)
         present = {self.elements[at] for at in set(atomic[atomic >= 0].tolist())}
         present |= set(GASES) if self.allowed is None else set(self.elements)
-        present -= self.banned
+        present -= banned
         minor = {
             self.elements[at]
             for at in range(len(self.elements))
             if self.elements[at] in present and part[at] < _MINOR and self.elements[at] not in GASES
         }
-        key = frozenset(present), frozenset(minor), frozenset(self.banned), frozenset(self.banned_ions)
+        key = frozenset(present), frozenset(minor), frozenset(banned), frozenset(self.banned_ions)
         if key not in self._tried:
-            ions = atomic_ions([name for name in self.elements if name not in self.banned])
+            ions = atomic_ions([name for name in self.elements if name not in banned])
             ions += [*molecular_ions(*key[:2]), *self._expected_ions]
             self._tried[key] = self.numbers([ion for ion in dict.fromkeys(ions) if ion not in self.banned_ions])
         tried = self._tried[key]

@@ -394,7 +394,8 @@ class _Named:
             UnexplainedPeak(float(contents.mass[at]), float(rest[at]), _perhaps(explanation, float(contents.mass[at])))
             for at in sorted(np.flatnonzero(large), key=lambda at: -abs(rest[at]))
         )
-        self.unexplained_part = float(np.abs(rest[large]).sum() / max(contents.total, 1.0))
+        # ions that are there and ions that are missing may be more than all
+        self.unexplained_part = min(float(np.abs(rest[large]).sum() / max(contents.total, 1.0)), 1.0)
         self.either = tuple(explanation.either.items())
 
     def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:

@@ -24,10 +24,13 @@ _NOMINAL = 5e-4  # width without a peak
 _OWN = 1.5
 """Times the common width, from which light peaks have their own. Where it is one: up to 1.45 in the 200 random
 specimens that it was chosen on; of 200 others 99 % have less than 1.43, and one has 1.54."""
-_FARTHEST = 500  # steps to the half height of one
+_FARTHEST = 500
+"""Steps to the half height of one. Of 96 made peaks of hydrogen, two to eight times as broad as the others, 95 % have
+errors below 3.5 %, and below 8 % with 250 steps (seed 202706)."""
 _SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
-_APART = 2.0  # standard deviations between two peaks; of nearer ones the higher is kept
+APART = 2.0
+"""Standard deviations between two peaks; of nearer ones the higher is kept."""
 
 
 class PeakScale:
@@ -195,7 +198,7 @@ def find_places(counts: Floats) -> tuple[Floats, Floats]:
     tops, _ = find_peaks(2 * np.sqrt(smooth * 2 * math.sqrt(math.pi) * BINS + 0.375), prominence=_PROMINENCE)
     kept: list[int] = []
     for top in tops.tolist():
-        if kept and top - kept[-1] < _APART * BINS:
+        if kept and top - kept[-1] < APART * BINS:
             if smooth[top] > smooth[kept[-1]]:
                 kept[-1] = top
             continue

@@ -68,6 +68,20 @@ def test_tails_of_neighbours_are_not_exchanged():
         assert distance(result.composition, truth(ions)) < 1.0
 
 
+def test_ions_in_the_broad_peaks_of_others_are_found():
+    """Re3+ in the tail of Sb2+, Pt3+ beside it, Cu+ in that of Re3+, In2+ before Ni+: L1 0.5, 0.3, 0.5 and 0.3 at.%.
+
+    Without the peaks in flanks and tails: SbH2 2+ for Re3+ (11.4), none for 63Cu+ (5.7) and In2+ (6.1).
+    """
+    rhenium = {("Mg", 2): 10, ("Mg", 1): 4, ("Re", 3): 3, ("Re", 2): 0.3, ("Sb", 2): 40, ("Sb", 1): 0.8, ("H", 1): 2}
+    copper = {("Gd", 3): 40, ("Gd", 2): 16, ("Cu", 1): 3, ("Cu", 2): 1.2, ("Re", 3): 40, ("Re", 2): 0.8, ("H", 1): 2}
+    indium = {("Ni", 1): 40, ("Ni", 2): 0.8, ("Hf", 1): 40, ("Hf", 2): 16, ("In", 2): 3, ("In", 1): 0.3, ("H", 1): 2}
+    for ions in (rhenium, copper, indium):
+        result = ae.spectrum(made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3))
+        assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+        assert distance(result.composition, truth(ions)) < 1.0
+
+
 def test_a_molecule_is_not_twice_itself_with_two_charges():
     ions = {("Au", 1): 1, ("AuO", 1): 6, ("Mn", 2): 10, ("Mn", 1): 1, ("MnO", 1): 6, ("O", 1): 5, ("O2", 1): 3}
     names = {ion.name for ion in ae.spectrum(made(ions, 150_000), list(truth(ions))).ions}
@@ -75,15 +89,18 @@ def test_a_molecule_is_not_twice_itself_with_two_charges():
 
 
 def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
-    """At 184 Da isotopes are three standard deviations apart: W+ is W+ with WH+, and the error says it."""
+    """At 184 Da isotopes are three, or two, standard deviations apart: W+, L1 0.3; "W+ or WH+", H 5.7 to 16."""
     ions = {("W", 2): 40, ("W", 1): 16, ("Y", 1): 40, ("Y", 2): 16, ("Pt", 2): 4, ("Cr", 2): 4, ("Cr", 1): 1.6}
     ions |= {("Mg", 1): 4, ("H", 1): 8}
     expected = truth(ions)
     result = ae.spectrum(made(ions, 300_000, width=1.2e-3, tail=4e-3, error=(6e-4, -1e-3)), list(expected))
+    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+    assert distance(result.composition, expected) < 0.6
+    result = ae.spectrum(made(ions, 300_000, width=1.8e-3, tail=6e-3, error=(6e-4, -1e-3)), list(expected))
     composition = result.composition
-    for element, value in expected.items():
+    for element in ("W", "Y", "Cr", "Mg", "H"):
         low, high = composition.span[element]
-        assert low - 2 * composition.error[element] < value < high + 2 * composition.error[element]
+        assert low - 2 * composition.error[element] < expected[element] < high + 2 * composition.error[element]
 
 
 @pytest.mark.parametrize("number", [1500, 12_000])
@@ -102,7 +119,7 @@ def test_broad_peaks_of_hydrogen_are_counted(rng, number):
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.exists(), reason="the measured Si.epos is not there")
 def test_hydrogen_of_measured_silicon():
-    """11,915 ions are found where the histogram has 11,700 above its background; 3,930 with the common width."""
+    """11,919 ions are found where the histogram has 11,700 above its background; 3,930 with the common width."""
     hits = ae.read(DATA / "Si.epos", columns=("mass_to_charge",))
     mass = hits.mass_to_charge.astype(float)
     inside, beside = (np.count_nonzero((mass > low) & (mass < high)) for low, high in ((0.975, 1.04), (1.06, 1.125)))
@@ -123,11 +140,16 @@ def test_an_element_of_one_line_that_is_not_counted_is_in_the_span():
 
 
 def test_a_molecule_that_may_be_isotopes_of_others_may_be_none():
-    """SnH2+ in the tails of Sn2+: H 4.1, or 3.7 at.% without it, true 3.7. Spans of Sn, Hf and Ni lack the truth."""
+    """SnH2+, two atoms of hydrogen, in the tails of Sn+: H 4.6, or 3.5 at.% without it, true 3.7; Sn and Ni are wrong.
+
+    With 300,000 ions and sharper peaks no hydride is named, and L1 is 0.9 at.%.
+    """
     ions = {("Ni", 2): 3, ("Ni", 1): 0.06, ("Zn", 2): 3, ("Zn", 1): 0.06, ("Sn", 2): 1, ("Sn", 1): 0.4, ("Hf", 3): 3}
     ions |= {("Hf", 2): 0.3, ("Sb", 1): 40, ("Sb", 2): 0.8, ("H", 1): 2}
     expected = truth(ions)
-    hits = made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3)
+    sharper = made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3)
+    assert distance(ae.spectrum(sharper, list(expected)).composition, expected) < 1.3
+    hits = made(ions, 100_000, width=1.4e-3, tail=5e-3)
     composition = ae.spectrum(hits, list(expected)).composition
     for element in ("H", "Sb"):
         (low, high), error = composition.span[element], composition.error[element]
@@ -152,6 +174,13 @@ def test_charges_of_the_made_ions_are_counted():
         expected = 60_000 * ions[ion.formula, ion.charge] / sum(ions.values())
         assert abs(ion.ions - expected) < 4 * np.hypot(ion.error, 0.01 * expected)
     assert {"C₂⁺", "C²⁺", "C₃²⁺"} <= {ion.name for ion in result.ions}
+
+
+def test_no_more_than_all_ions_are_unexplained():
+    """Nitrogen is named at 15 Da, and most of it is missing at 14 Da: there and here 168 % of the ions."""
+    hits = made({("Si", 2): 5, ("Si", 1): 1}, 36_000, isotopes={"Si": {28: 0.01, 30: 0.99}})
+    result = ae.spectrum(hits)
+    assert result.unexplained_part == 1 and "100.0% of the ions in peaks are unexplained" in result.composition.refused
 
 
 @pytest.mark.slow
