@@ -52,9 +52,9 @@ def reconstruct(
         Table of where the ions of simulated hits came from. Lateral positions are corrected by it, and get covariances.
         The hits must have the axes of the simulated specimen.
     twin : Run, optional
-        Simulated run of the matrix alone, in the orientation and with the emission of the measurement, for an evolving
-        shape. The mean errors of its reconstruction at the place of each ion are taken off, if its density on the
-        detector describes the measured one better than an even one does: the verdict says so.
+        Simulated run of the matrix alone, in the orientation of the measurement and with its emission as the first one
+        that was flown, for an evolving shape. The mean errors of its reconstruction at the place of each ion are taken
+        off, if its density on the detector describes the measured one better than an even one: the verdict says so.
     **constants
         Fields of `ReconstructionSettings` by name, instead of the object, or to replace some of its fields.
 
