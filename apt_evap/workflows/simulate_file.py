@@ -178,8 +178,8 @@ def simulate(
     cost = estimate_cost(config, 1)
     stored = Checkpoint(path, checkpoint, resume=resume, overwrite=overwrite)
     n_previous = stored.ions_there() if resume else 0
-    complete = n_previous == n_ions and not stored.unfinished.exists()
-    if complete and (run := load(path)).provenance.get("settings") == config.key:
+    complete = n_previous == n_ions and not stored.unfinished.exists() and not (run := load(path)).ended
+    if complete and run.provenance.get("settings") == config.key:
         if picture.exists():
             note(f"{path} is complete: nothing to do, overwrite=True (--force) begins again")
             return Simulated(run, path, None, [], [], 0.0)
