@@ -236,7 +236,7 @@ def spectra_once(_spectra, monkeypatch):
 
 @pytest.fixture
 def rough_layout(monkeypatch):
-    """Pictures are laid out once instead of three times: for tests that do not look where their labels are."""
+    """Pictures are laid out once instead of up to three times: for tests that do not look where their labels are."""
     monkeypatch.setattr("apt_evap.plot._figure._Layout.execute", ConstrainedLayoutEngine.execute)
 
 

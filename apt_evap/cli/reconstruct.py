@@ -239,13 +239,13 @@ def _extent(options, hits):
 
 def _surface(options, hits, ranges):
     """Arguments of `reconstruct` for the surface."""
-    from apt_evap.simulation.run import load
-
     for name in ("solutes", "labels", "twin"):
         if options.shape == "cap" and getattr(options, name):
             raise ValueError(f"--{name} needs --shape evolving, got --shape cap")
     arguments = {"shape": options.shape, "ranges": ranges}
     if options.twin:
+        from apt_evap.simulation.run import load
+
         arguments["twin"] = load(options.twin)
     if options.solutes:
         arguments["solutes"] = tuple(options.solutes.split(","))

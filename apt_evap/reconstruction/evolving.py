@@ -419,6 +419,7 @@ def follow_surface(
     places, angles = cap.geometry.places(cap.hits, cap.radii)
     voltages, factors, jumps, why = _relative_voltages(cap.hits, cap)
     radius, growth = _growth_of(cap, factors if jumps else 1.0)
+    twin_errors = None if twin is None else TwinErrors.of(twin, rim)  # a wrong one is refused before the passes
     ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius, growth)
     measured = _Measured(ions, voltages, names, own, labels is not None, jumps)
     every = -(-len(cap) // _ION_LIMIT)
@@ -427,7 +428,7 @@ def follow_surface(
     if isinstance(fixed, str):
         return _as_cap(cap, fixed + (f" ({why})" if why else ""))
     found = _placed(cap, measured, fixed, every, why, thinned)
-    return found if twin is None else _corrected(found, TwinErrors.of(twin, rim), ions.directions)
+    return found if twin_errors is None else _corrected(found, twin_errors, ions.directions)
 
 
 def _check_sequence(hits):
@@ -758,7 +759,7 @@ def _placed(cap, measured, fixed, every, why, thinned):
 def _corrected(found, twin, directions):
     """The reconstruction without the mean errors of the twin, unless its density does not describe the measured one."""
     gain = twin.gain(directions)
-    said = f"; the twin {{}}, its density at the ions is {math.exp(gain):.3f} of an even one"
+    said = f"; the twin {{}}: by its density the ions are {math.exp(gain):.3f} times as likely as by an even one"
     if gain <= 0:
         return replace(found, verdict=found.verdict + said.format("is not used"))
     shifts = twin.shifts_at(directions, found.radii) * (1.0, 1.0, -1.0)  # depth in place of z

@@ -11,6 +11,7 @@ import pytest
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle
 from matplotlib.text import Text
 
@@ -78,6 +79,21 @@ def test_nothing_of_a_map_is_cut_off(half, title, height):
     for figure in (ax.figure, alone.figure):
         assert_nothing_cut_off(figure)
     assert len(axes) == 1
+
+
+@pytest.mark.parametrize(("changes", "passes"), [(0, 1), (1, 2), (5, 3)])
+def test_a_layout_is_repeated_while_it_changes_ticks(monkeypatch, changes, passes):
+    figure = plot.new_figure((3.0, 3.0))
+    ax = figure.subplots()
+    done = []
+
+    def lay_out(self, figure):
+        ax.set_xticks(range(2 + min(len(done), changes - 1)) if changes else ax.get_xticks())
+        done.append(1)
+
+    monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lay_out)
+    figure.get_layout_engine().execute(figure)
+    assert len(done) == passes
 
 
 def test_titles_are_broken_at_commas():

@@ -78,7 +78,9 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     directions = patterned(5000, np.random.default_rng(6))
     plain, found = evolving(directions), evolving(directions, twin=run)
     # exp(0.019): the gain of the test above
-    assert found.verdict == plain.verdict + "; the twin is used, its density at the ions is 1.019 of an even one"
+    assert found.verdict == plain.verdict + (
+        "; the twin is used: by its density the ions are 1.019 times as likely as by an even one"
+    )
     shifts = twin.shifts_at(directions, np.full(len(directions), 40.0))
     np.testing.assert_allclose(found.specimen_positions - plain.specimen_positions, shifts, atol=1e-12)
     exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
@@ -92,12 +94,21 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     )
     flat = even_flux(5000, RIM)
     plain, refused = evolving(flat), evolving(flat, twin=run)
-    assert "; the twin is not used, its density at the ions is 0.9" in refused.verdict
+    assert "; the twin is not used: by its density the ions are 0.9" in refused.verdict
     assert refused.twin_errors is None
     np.testing.assert_array_equal(refused.positions, plain.positions)
     # the cap in place of the surface: nothing to correct
     few = evolving(flat[:50], twin=run)
     assert few.verdict == "cap: 50 ions, fewer than 2,000"
+
+    def refuse(run, rim):
+        raise ValueError("twin must be another one")
+
+    # before the passes, which take seconds
+    monkeypatch.setattr(TwinErrors, "of", refuse)
+    monkeypatch.setattr("apt_evap.reconstruction.evolving._fixed_point", None)
+    with pytest.raises(ValueError, match="twin must be another one"):
+        evolving(flat, twin=run)
     with pytest.raises(ValueError, match='twin is for shape="evolving"'):
         ae.reconstruct(few.hits, twin=run, **known)
     with pytest.raises(ValueError, match="twin must be a Run"):
