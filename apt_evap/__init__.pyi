@@ -1,5 +1,4 @@
 # The public names of the package: read by type checkers, and by the lazy loader in __init__.py.
-from . import analysis as analysis
 from . import detection as detection
 from . import emission as emission
 from . import evaporation as evaporation

@@ -69,7 +69,6 @@ def thumbnails(folder):
 
 # pages that explain the names of a namespace
 _GUIDES = {
-    "analysis": "charge_states real_units field_ion_image",
     "detection": "instruments microscope howto/correct_distortion",
     "emission": "emission charge_states extending",
     "evaporation": "charging_rules laws temperature extending_physics",
@@ -78,9 +77,9 @@ _GUIDES = {
     "maps": "map_measures howto/find_orientation howto/correct_distortion",
     "measures": "howto/measure_clusters",
     "reconstruction": "reconstruction reconstruction_errors",
-    "simulation": "flights howto/resume real_units",
+    "simulation": "flights howto/resume real_units field_ion_image",
     "specimen": "specimens materials howto/own_structure",
-    "spectra": "howto/mass_spectrum",
+    "spectra": "howto/mass_spectrum charge_states",
     "studies": "howto/sweep howto/data_set howto/visibility",
     "units": "conventions",
 }

@@ -85,7 +85,7 @@ else:
     # charges whose lines are where measured ones are, as those of `apt-evap start`
     run = ae.Simulation(tip, rule=ae.ConstantPotential(), seed=1).run(ions)
     run.save(folder / "run.h5")
-compression = ae.analysis.image_compression(run).compression
+compression = ae.simulation.image_compression(run).compression
 distance = 100.0
 run = run.on_detector(ae.Detector(distance=distance, width=4 * distance, projection="equidistant"))
 print(run)

@@ -74,7 +74,7 @@ def main():
         for seed, path in enumerate(paths, 1):
             if not path.exists():
                 simulated(element, radius, skip, ions, seed).save(path)
-        pattern = ae.analysis.master_pattern([ae.load(path) for path in paths])
+        pattern = ae.fit.master_pattern([ae.load(path) for path in paths])
         path = PATTERNS / f"{pattern.structure}_{radius}.npz"
         pattern.save(path)
         print(f"{path.name}: {pattern.ions:,} ions, {path.stat().st_size / 1e3:.0f} kB")

@@ -13,7 +13,7 @@ def fit_sphere(points: Floats, chosen: Integers | None = None) -> tuple[Floats, 
     """Centre and radius of the sphere through points [nm], shape (n, 3), or those with the indices `chosen`.
 
     It minimises the sum of (|r - c|^2 - R^2)^2, a linear problem for c and R^2 - |c|^2. On a rough cap it is a little
-    too small, and single points far inside make it smaller: `analysis.fit_caps` is robust against them.
+    too small, and single points far inside make it smaller: `simulation.fit_caps` is robust against them.
     """
     chosen = np.arange(len(points)) if chosen is None else chosen
     middle, matrix, right = sphere_equations(np.ascontiguousarray(points, np.float64), chosen)

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap.analysis.apex import image_compression
-from apt_evap.analysis.ion_image import field_ion_image
 from apt_evap.cli._files import blocks_of, file_of, in_real_units, note, read
 from apt_evap.cli._output import say, tell
 from apt_evap.detection.detector_map import DetectorMap
@@ -17,8 +15,10 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import index
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.plot.map_figures import binned, binned_blocks, default_smoothing, specimen_title
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.config.material_text import read_material
 from apt_evap.simulation.config.perturbation_text import read_perturbation
+from apt_evap.simulation.ion_image import field_ion_image
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.surface import surface_after
 from apt_evap.workflows.maps_of_run import phase_maps, run_maps, settings_of_maps

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.files import FileError
-from apt_evap.analysis.description import UNITS, describe, describe_atoms, describe_blocks
 from apt_evap.cli._files import blocks_of, file_of, read
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.io._texts import without_compression
 from apt_evap.io.formats import RANGE_FORMATS, read_ranges
 from apt_evap.io.specimens import read_atoms, specimen_format, tip_of, types_of
+from apt_evap.simulation.description import UNITS, describe, describe_atoms, describe_blocks
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.stop_reason import StopReason
 from apt_evap.specimen.orientation_check import warn_of_shape

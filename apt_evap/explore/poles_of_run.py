@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.projection import Projection
 from apt_evap.explore.explorer_maps import ExplorerMaps
 from apt_evap.explore.marks import Overlay, overlay
@@ -18,6 +17,7 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.registration.verdict import Likeness, likeness, symmetric_places
 from apt_evap.maps.rings import Ring, ring_statistics
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.symmetry import pole_symmetry
 

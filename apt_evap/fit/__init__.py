@@ -1,4 +1,4 @@
-"""Fit of the emission energies to a measured map; settings of a simulation and constants from a measurement."""
+"""Fits of emission energies to a measured map; settings, constants and patterns from measurements and runs."""
 
 import lazy_loader
 

@@ -11,8 +11,6 @@ import numpy as np
 from apt_evap._common.codec import for_json
 from apt_evap._common.threads import thread_count
 from apt_evap._common.validation import check_kind
-from apt_evap.analysis.apex import image_compression
-from apt_evap.analysis.description import microscope_of
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.energies import Thermal
@@ -27,6 +25,8 @@ from apt_evap.fit.structure import PoleMeasure, StructureScores
 from apt_evap.fit.study import RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.registration.register import Registration
+from apt_evap.simulation.apex import image_compression
+from apt_evap.simulation.description import microscope_of
 from apt_evap.simulation.run import Run
 from apt_evap.warnings import MapWarning, RegistrationWarning, ResponseWarning, StructureWarning, warn
 

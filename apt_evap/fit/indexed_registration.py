@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.perturbations import LateralVelocity, Perturbation, RollUp
@@ -15,6 +14,7 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import LEAST_IONS, Indexing, index
 from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.maps.registration.register import Registration, at_bound, register, register_points
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.symmetry import point_group
 from apt_evap.warnings import RegistrationWarning, WorkflowWarning, warn

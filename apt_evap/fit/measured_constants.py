@@ -12,7 +12,6 @@ import scipy
 from apt_evap._common.digits import rounded_text
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.validation import check_kind, check_number
-from apt_evap.analysis.charge_states import LEAST, charge_history, field_of_counts, ion_charges, ratio_of_counts
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
@@ -25,6 +24,7 @@ from apt_evap.reconstruction.reconstruct import reconstruct
 from apt_evap.reconstruction.shank import fit_shank
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import EVAPORATION_FIELD_ERROR
+from apt_evap.spectra.charge_states import LEAST, charge_history, field_of_counts, ion_charges, ratio_of_counts
 
 _ENDS = 1000  # ions at the beginning and at the end, for the voltages there
 _IONS = 20_000  # that are reconstructed for the angle of the shank

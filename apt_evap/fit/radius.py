@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_number, check_sequence
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.fit.structure import Structure
@@ -20,6 +19,7 @@ from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.pole_frame import Directions
 from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.rings import RINGS, ring_statistics
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 
 RADII = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0)

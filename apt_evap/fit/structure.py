@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from apt_evap._common.codec import to_plain
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats, Integers
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.directions import plain_label, plane_normals, poles
@@ -28,6 +27,7 @@ from apt_evap.maps.pole_profiles import pole_profile
 from apt_evap.maps.profiles import Profile
 from apt_evap.maps.registration.register import Registration
 from apt_evap.maps.rings import RINGS, LineAmplitude, Ring, line_amplitude, ring_statistics
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.symmetry import pole_symmetry
 

@@ -8,7 +8,6 @@ from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_array, check_choice, check_kind
-from apt_evap.analysis.charge_states import ChargeStateMap
 from apt_evap.plot._figure import (
     OUTSIDE,
     add_colorbar,
@@ -20,6 +19,7 @@ from apt_evap.plot._figure import (
     with_default_settings,
 )
 from apt_evap.plot.map_figures import describe
+from apt_evap.spectra.charge_states import ChargeStateMap
 
 _LEAST_RANGE = {
     "ratio": 1.5,

@@ -7,11 +7,11 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from apt_evap._common.validation import check_choice, check_count, check_kind
-from apt_evap.analysis.charge_states import LEAST, charge_history, ion_charges
-from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import ion_label, new_figure, set_log_ticks, with_default_settings
 from apt_evap.simulation.run import Run
+from apt_evap.simulation.voltage_history import evaporation_voltages, smoothed_history
+from apt_evap.spectra.charge_states import LEAST, charge_history, ion_charges
 from apt_evap.spectra.mass_ranges import Ranges
 
 _PER_SECTION = 100  # ions of a section in which they are counted: an error of 10 %

@@ -10,7 +10,6 @@ from matplotlib.patheffects import withStroke
 
 from apt_evap._common.label_places import place_labels
 from apt_evap._common.validation import check_kind
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.crystallography.directions import ZONES, zones
@@ -19,6 +18,7 @@ from apt_evap.maps.crystallography.directions import poles as poles_of
 from apt_evap.maps.crystallography.orientation import FittedOrientation, Orientation
 from apt_evap.plot._figure import DrawnAxes, with_default_settings
 from apt_evap.plot._labels import Placement, box_of, place_text, sizes_of
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 
 _COLORS = ("#35b6ff", "#ff9d3b", "#7be07b", "#e58cff")

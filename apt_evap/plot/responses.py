@@ -12,8 +12,8 @@ from matplotlib.colors import Normalize
 from numpy.typing import ArrayLike
 
 from apt_evap._common.validation import short_text
-from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.plot._figure import DrawnAxes, new_figure, set_title, with_default_settings
+from apt_evap.simulation.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.simulation.run import Run
 
 MECHANISMS = ("lateral velocity", "roll-up")

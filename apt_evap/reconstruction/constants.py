@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from apt_evap._common.validation import check_kind, check_number
-from apt_evap.analysis.apex import fit_caps, image_compression
+from apt_evap.simulation.apex import fit_caps, image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import atom_density
 

@@ -21,8 +21,8 @@ from apt_evap._common.validation import (
     check_sequence,
     check_switch,
 )
-from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.emission.perturbations import Perturbation, Unperturbed
+from apt_evap.simulation.apex import fit_caps, image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import rotation_to_axis
 from apt_evap.specimen.materials import Material

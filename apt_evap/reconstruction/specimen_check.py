@@ -11,9 +11,9 @@ import scipy
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_count, check_kind, check_number
-from apt_evap.analysis.apex import image_compression
 from apt_evap.evaporation.rule import ConstantPotential
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.lattice import atom_density
 from apt_evap.specimen.materials import Material

@@ -1,4 +1,4 @@
-"""The simulation and its runs: flights and responses, monitoring, files, checkpoints, real units."""
+"""The simulation and its runs: flights and responses, files, real units, the apex, tracks, field-ion images."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Mass spectra: ranges, isotopes, the ions that explain the peaks, and the flight length that fits them."""
+"""Mass spectra: ranges, isotopes, the ions that explain the peaks, the flight length, ratios of charge states."""
 
 import lazy_loader
 

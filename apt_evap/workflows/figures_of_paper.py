@@ -20,7 +20,6 @@ from apt_evap._common.codec import for_json, to_plain
 from apt_evap._common.files import FileError, check_path, replace_file
 from apt_evap._common.kept import check_made_from
 from apt_evap._common.types import AnyPath, Floats, Integers
-from apt_evap.analysis.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.detection.detector import Detector
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
@@ -36,6 +35,7 @@ from apt_evap.plot.profile_figures import rectangles as draw_rectangles
 from apt_evap.plot.report.html_page import Page, heading, paragraph
 from apt_evap.plot.responses import ion_colors
 from apt_evap.plot.specimen_figures import mark_atoms
+from apt_evap.simulation.response_tracks import lateral_tracks, rollup_tracks
 from apt_evap.simulation.run import Run
 from apt_evap.simulation.simulation import Simulation
 from apt_evap.specimen.materials import Material, as_material

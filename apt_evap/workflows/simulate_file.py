@@ -10,12 +10,12 @@ from typing import Any
 from apt_evap._common.files import FileError, check_path
 from apt_evap._common.notebook import as_table
 from apt_evap._common.types import AnyPath
-from apt_evap.analysis.description import real_units_line
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.simulation.checkpoint import Checkpoint
 from apt_evap.simulation.config.cost_estimate import estimate_cost
 from apt_evap.simulation.config.simulation_file import config_of, read_document
 from apt_evap.simulation.config.simulation_settings import Config
+from apt_evap.simulation.description import real_units_line
 from apt_evap.simulation.recorder import RunInterrupted
 from apt_evap.simulation.run import Run, load
 from apt_evap.simulation.run_hdf5 import is_run

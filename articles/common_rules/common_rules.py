@@ -91,7 +91,7 @@ def main():
         pass
     run = simulation.run(options.ions, list(emissions.values()), responses=False)
     hits = {name: run.hits(each) for name, each in emissions.items()}
-    projection = ae.analysis.image_compression(run).projection
+    projection = ae.simulation.image_compression(run).projection
     poles = ae.Orientation.from_settings(run.settings["tip"]).directions(
         np.array([(a, b, c) for a in (1, -1) for b in (1, -1) for c in (1, -1)]) / np.sqrt(3)
     )

@@ -84,7 +84,7 @@ class Crystal:
         self.orientation = ae.Orientation.from_settings(run.settings["tip"])
         self.group = point_group(self.orientation.material.structure)
         real = run.at_evaporation_field()
-        projection = ae.analysis.image_compression(run).projection
+        projection = ae.simulation.image_compression(run).projection
         self.ions = [_flattened(projection, real.hits(emission), self.orientation.matrix) for emission in EMISSIONS]
 
     def map(self, seed, least=4_000, second=0.0):

@@ -69,7 +69,7 @@ def main():
     for twin in range(options.twins):
         hidden = float(np.exp(np.random.default_rng((8, twin)).uniform(np.log(LOW), np.log(HIGH))))
         run = run_of(100 + twin, hidden, round(options.layers * LAYER * hidden**2), options.folder)
-        projection = ae.analysis.image_compression(run).projection
+        projection = ae.simulation.image_compression(run).projection
         fit = ae.fit.fit_radius(family, counts(run), projection, EMISSION, (1, 1, 1), fold=3, rings=RINGS, radii=EDGES)
         found, (low, high) = fit.radius / 0.352, (bound / 0.352 for bound in fit.interval)
         inside += low <= hidden <= high

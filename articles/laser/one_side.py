@@ -96,7 +96,7 @@ def draw(run, axes, title, last=60_000):
     hits = real.hits(ae.Unperturbed())
     ae.plot.detector_map(hits.map(bins=100), ax=axes[1])
     axes[1].set_title("ions")
-    states = ae.analysis.charge_state_ratio_map(hits, "Ni", bins=20).to_map()
+    states = ae.spectra.charge_state_ratio_map(hits, "Ni", bins=20).to_map()
     shown = axes[2].pcolormesh(
         states.x_edges, states.y_edges, np.where(states.mask, states.values, np.nan), norm=LogNorm(1e-3, 1.0)
     )

@@ -60,7 +60,7 @@ def main():
     for name, (*specimen, emission) in SECOND.items():
         run = run_of(options.folder, name, *specimen)
         moved = ae.Registration(50.0, SMALLER, (2.0, -1.0)).hits(run.hits(emission))
-        radius = SMALLER * ae.analysis.image_compression(run).projection.scale * FIELD_OF_VIEW
+        radius = SMALLER * ae.simulation.image_compression(run).projection.scale * FIELD_OF_VIEW
         maps[name] = ae.Hits(x=moved.x, y=moved.y).within_circle(radius, (4.0, -1.0)).map(bins=64)
         structures[name] = ae.material(specimen[0]).structure
     grid = ae.fit.EnergyGrid("roll-up", options={"probability": (0.0, 0.5, 1.0)}, relative_spreads=(0.1, 1.0))

@@ -73,7 +73,7 @@ def draw(axis, name, run, emission, bins):
     ae.plot.detector_map(counts.flattened(25.0).smoothed(1.0), axis, title=name, colorbar=False, caption=False)
     orientation = ae.Orientation.from_settings(run.settings["tip"])
     ae.plot.poles(
-        axis, orientation, ae.analysis.image_compression(seen).projection, families=6, zone_families=(), size=7
+        axis, orientation, ae.simulation.image_compression(seen).projection, families=6, zone_families=(), size=7
     )
 
 

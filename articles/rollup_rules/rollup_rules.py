@@ -52,7 +52,7 @@ parser.add_argument("-o", "--output", metavar="PICTURE.png", help="picture of fo
 options = parser.parse_args()
 run = ae.load(options.run) if options.run else evaporate(*((40, 50_000) if options.full else (12, 3_000)))
 
-projection = ae.analysis.image_compression(run).projection
+projection = ae.simulation.image_compression(run).projection
 print("contrast in rings of 5-9, 9-14 and 14-20 degrees; density within 1, 2, 3 and 6 degrees over the mean")
 for name, perturbation in RULES.items():
     counted = counts(run, perturbation)

@@ -43,7 +43,7 @@ ions = options.ions or (60_000 if options.full else 8_000)
 print("temperature, perturbation: contrast in rings of 5-9, 9-14 and 14-20 degrees")
 for temperature in options.temperatures:
     run = evaporate(temperature, radius, ions)
-    projection = ae.analysis.image_compression(run).projection
+    projection = ae.simulation.image_compression(run).projection
     for name, perturbation in (("unperturbed", ae.Unperturbed()), ("roll-up", ROLL_UP)):
         rings = ae.maps.ring_statistics(counts(run, perturbation), projection, fold=3)
         numbers = ", ".join(f"{ring.contrast:.2f} ± {ring.error:.2f}" for ring in rings)

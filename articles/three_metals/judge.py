@@ -158,7 +158,7 @@ def projection_of(run):
     """Projection with the image compression of the unperturbed ions between 8 degrees and 2 degrees from the rim."""
     hits = run.hits(ae.Unperturbed())
     crystal = np.empty(len(run))
-    for cap in ae.analysis.fit_caps(run):
+    for cap in ae.simulation.fit_caps(run):
         sites = run.emissions.positions[cap.first : cap.last] - cap.centre
         crystal[cap.first : cap.last] = np.degrees(np.arccos(sites[:, 2] / np.linalg.norm(sites, axis=1)))
     seen = run.detector.seen_from_apex

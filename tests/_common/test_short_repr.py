@@ -2,9 +2,6 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis.apex import FittedCap, ImageCompression
-from apt_evap.analysis.response_tracks import Tracks
-from apt_evap.analysis.voltage_history import SmoothedHistory
 from apt_evap.emission.emissions import TangentialLaunches
 from apt_evap.explore.specimen_surface import SurfaceAtoms
 from apt_evap.fit.structure import StructureScores
@@ -12,7 +9,10 @@ from apt_evap.maps.crystallography.directions import Poles, Zones, poles
 from apt_evap.maps.crystallography.orientation import FittedOrientation
 from apt_evap.maps.profiles import Profile, ProfileComparison
 from apt_evap.reconstruction.errors import ErrorBins, GroupErrors
+from apt_evap.simulation.apex import FittedCap, ImageCompression
 from apt_evap.simulation.history import CapHistory, History
+from apt_evap.simulation.response_tracks import Tracks
+from apt_evap.simulation.voltage_history import SmoothedHistory
 
 WITH_ARRAYS = (
     FittedCap, ImageCompression, Profile, ProfileComparison, Tracks, SmoothedHistory, FittedOrientation, Poles, Zones,

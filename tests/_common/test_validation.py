@@ -34,8 +34,6 @@ from apt_evap._common.validation import (
     check_values,
     short_text,
 )
-from apt_evap.analysis.ion_image import tunnel_factor
-from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 from apt_evap.detection.hits import Hits
 from apt_evap.emission.emissions import Emissions
 from apt_evap.emission.perturbations import perturbation_of
@@ -45,7 +43,9 @@ from apt_evap.maps.noise import effective_ions
 from apt_evap.maps.registration.polynomial import Distortion
 from apt_evap.simulation.config.cost_estimate import CostEstimate
 from apt_evap.simulation.config.simulation_file import read_config
+from apt_evap.simulation.ion_image import tunnel_factor
 from apt_evap.simulation.real_units import RealUnits
+from apt_evap.simulation.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 from apt_evap.specimen.lattice import nearest_neighbour_distance
 from apt_evap.specimen.shape import TaperedCap
 from apt_evap.specimen.symmetry import point_group, pole_symmetry, symmetry_about_axis
@@ -200,7 +200,10 @@ def ready():
     """A simulation, its run, and the ions on file."""
     simulation = ae.Simulation(shell, n_threads=1)
     run = simulation.run(12, progress=False)
-    bound = {"fit_energies": partial(ae.fit_energies, run), "lateral_tracks": partial(ae.analysis.lateral_tracks, run)}
+    bound = {
+        "fit_energies": partial(ae.fit_energies, run),
+        "lateral_tracks": partial(ae.simulation.lateral_tracks, run),
+    }
     return {
         "simulation": simulation,
         "run": run,
@@ -312,10 +315,10 @@ CASES = [
         ends=[(0.0, 0.0), (1.0, 1.0, 1.0, 1.0), (NAN, 0.0, 1.0, 1.0)],
     ),
     row(ae.maps.line_amplitude, {"ring": azimuths, "measured": azimuths}),
-    row(ae.analysis.charge_history, {"charges": [1, 2, 2], "element": "Ni"}, sections=[0], least=[0]),
+    row(ae.spectra.charge_history, {"charges": [1, 2, 2], "element": "Ni"}, sections=[0], least=[0]),
     row(smoothed_history, {"values": [1.0, 2.0]}, points=[0]),
-    row(ae.analysis.charge_state_ratio_map, {"element": "Ni"}),
-    row(ae.analysis.charge_state_ratio_history, {"element": "Ni"}),
+    row(ae.spectra.charge_state_ratio_map, {"element": "Ni"}),
+    row(ae.spectra.charge_state_ratio_history, {"element": "Ni"}),
     row(ae.Instrument, dead_time=[-0.1], dead_zone=[-0.1], resolution=[-0.1], quantisation=[(0.0, 1.0), (1.0, -1.0)]),
     row(ae.Instrument.preset, {"name": "straight, 100 mm"}, "efficiency", efficiency=[1.1]),
     row(ae.Instrument().record),
@@ -540,7 +543,7 @@ CASES = [
         perturbations=[(), (ae.RollUp(0.2),), (ae.RollUp(0.2), "x")],
         weights=[(1.0,), (1.0, -1.0), (1.0, NAN)],
     ),
-    row(ae.analysis.ImagingGas, {"name": "Xe", "ionisation_energy": 12.13, "field": 15.0}, "ionisation_energy field"),
+    row(ae.simulation.ImagingGas, {"name": "Xe", "ionisation_energy": 12.13, "field": 15.0}, "ionisation_energy field"),
     row(
         ae.maps.pole_profile,
         {"map": grid, "projection": ae.detection.Projection(10.0, centre=(10.0, 10.0))},
@@ -635,7 +638,7 @@ NEEDS_A_RUN = [
     ),
     row("run.on_detector"),
     row("real.record", {"instrument": ae.Instrument()}),
-    row(ae.analysis.fit_caps, {"windows": 1}),
+    row(ae.simulation.fit_caps, {"windows": 1}),
     row(ae.reconstruction.origin_table),
     row(ae.fit.fit_tips, {"measured": hits}),
     row(
@@ -647,14 +650,14 @@ NEEDS_A_RUN = [
             "plane": (1, 1, 1),
         },
     ),
-    row(ae.analysis.field_ion_image),
+    row(ae.simulation.field_ion_image),
     row(target_shares, {"sharpness": 0.1}),
-    row(ae.analysis.image_compression),
+    row(ae.simulation.image_compression),
     row(evaporation_fields),
     row(evaporation_voltages),
     row(ae.reconstruction.run_constants),
-    row(ae.analysis.lateral_tracks, {"ions": [0], "energies": [0.1]}),
-    row(ae.analysis.rollup_tracks, {"ions": [0], "energies": [0.1]}),
+    row(ae.simulation.lateral_tracks, {"ions": [0], "energies": [0.1]}),
+    row(ae.simulation.rollup_tracks, {"ions": [0], "energies": [0.1]}),
     row(ae.fit_energies, {"measured": hits}),
     row("tracks", {"energies": [0.1]}, ions=[[0.5], [-1], [99], [2**70]]),
     row("tracks", {"ions": [0]}, energies=[[NAN], [-1.0], [99.0]]),

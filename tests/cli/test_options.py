@@ -6,7 +6,6 @@ from dataclasses import MISSING, fields
 import pytest
 
 from apt_evap._common.codec import declared
-from apt_evap.analysis.ion_image import GASES
 from apt_evap.cli._declared_options import declarations
 from apt_evap.cli.parser import make_parser
 from apt_evap.detection.binning import MAX_BINS
@@ -14,6 +13,7 @@ from apt_evap.fit.fit_settings import FitSettings
 from apt_evap.fit.grid import MEANS, MECHANISMS, ROLLUP_FRACTIONS, RSDS, EnergyGrid
 from apt_evap.reconstruction.reconstructed import FRAMES
 from apt_evap.reconstruction.reconstruction_settings import PROJECTIONS, PROTOCOLS, ReconstructionSettings
+from apt_evap.simulation.ion_image import GASES
 
 
 @pytest.fixture(scope="module")

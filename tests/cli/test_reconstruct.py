@@ -162,7 +162,7 @@ def test_the_constants_of_a_run_are_its_own(radius5, tmp_path, monkeypatch, caps
         settings = result["settings"]
         radii = real.voltages / (settings["field_factor"] * settings["evaporation_field"])
         assert np.median(radii) == pytest.approx(5.0, rel=0.02)  # the cap of the first ions, between its terraces
-        assert settings["compression"] == pytest.approx(ae.analysis.image_compression(run).compression)
+        assert settings["compression"] == pytest.approx(ae.simulation.image_compression(run).compression)
         assert settings["projection"] == "compressed" and settings["atomic_volume"] == pytest.approx(0.352**3 / 4)
         # measured 0.19 and 0.08 nm; with 3.3 and 1.5 the radius is 1.7 nm and its errors are larger
         assert result["errors"]["lateral_rms"] < 0.25 and result["errors"]["depth_rms"] < 0.12

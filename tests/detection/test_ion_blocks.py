@@ -196,7 +196,7 @@ def test_the_sample_of_blocks_is_that_of_all_ions(monkeypatch, rows):
     assert all(map(np.array_equal, field.sample, (x[::3], y[::3])))
 
 
-@pytest.mark.usefixtures("hashed_pictures")
+@pytest.mark.usefixtures("hashed_pictures", "spectra_once")
 def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
     """Isotopes that are lost in pulses of several ions, which a note beside every composition says."""
     monkeypatch.chdir(tmp_path)

@@ -270,7 +270,7 @@ def test_rings_about_the_pole(run20):
     """[111] has three-fold symmetry; the ring statistic is that of the library, in the frame of the measured map."""
     run = replace(run20, perturbations=(), flown=())  # its responses alone
     registration = ae.Registration(33.0, 0.4, (4.0, -3.0))
-    projection = ae.analysis.image_compression(run).projection
+    projection = ae.simulation.image_compression(run).projection
     alone = Explorer(run)
     assert alone.poles.pole(None).label == "$111$" and alone.poles.pole(None).fold == 3
     assert alone.poles.pole(None).place == pytest.approx((0.0, 0.0), abs=1e-9)  # mm: rounding

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis.apex import image_compression
 from apt_evap.fit.indexed_registration import (
     HEIGHT,
     emission_of_pattern,
@@ -17,6 +16,7 @@ from apt_evap.fit.indexed_registration import (
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.index_map import Candidate, Indexing
 from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.simulation.apex import image_compression
 from apt_evap.specimen.symmetry import point_group
 from apt_evap.workflows import compare_maps
 

@@ -79,7 +79,7 @@ def window(run):
 @pytest.mark.slow
 def test_runs_and_a_map(family):
     measured = family[2]
-    projection = ae.analysis.image_compression(measured).projection
+    projection = ae.simulation.image_compression(measured).projection
     fit = ae.fit.fit_radius(
         family,
         window(measured),
@@ -107,7 +107,7 @@ def test_runs_and_a_map(family):
 )
 def test_bad_arguments_are_refused(pretended, change, message):
     measured = window(pretended[0])
-    projection = ae.analysis.image_compression(pretended[0]).projection
+    projection = ae.simulation.image_compression(pretended[0]).projection
     runs = pretended[: change.pop("runs", 4)]
     arguments = {"perturbations": ae.RollUp(ENERGY, probability=0.5), "plane": (1, 1, 1)} | change
     with pytest.raises(ValueError, match=message):

@@ -57,10 +57,10 @@ def test_large_tips_have_narrow_poles():
 
 @pytest.mark.slow
 def test_a_pattern_is_the_direct_sum_over_the_point_group(run):
-    pattern = ae.analysis.master_pattern(run)
+    pattern = ae.fit.master_pattern(run)
     assert pattern.structure == "fcc" and pattern.apex_radius == 9 and pattern.ions == 3_000
     orientation = ae.Orientation.from_settings(run.settings["tip"])
-    projection = ae.analysis.image_compression(run).projection
+    projection = ae.simulation.image_compression(run).projection
     hits = run.hits(run.perturbations[0])
     directions = projection.directions(np.column_stack([hits.x, hits.y])[hits.detected])
     crystal = directions[directions[:, 2] > np.cos(np.radians(50))] @ orientation.matrix
@@ -88,7 +88,7 @@ def test_a_pattern_is_the_direct_sum_over_the_point_group(run):
 
 
 def test_a_saved_pattern_is_read_back(run, tmp_path):
-    pattern = ae.analysis.master_pattern([run])
+    pattern = ae.fit.master_pattern([run])
     pattern.save(tmp_path / "mine.npz")
     again = MasterPattern.load(tmp_path / "mine.npz")
     assert (again.structure, again.apex_radius, again.ions) == ("fcc", 9.0, 3_000)
@@ -117,9 +117,9 @@ def test_bad_arguments_are_named(run):
     with pytest.raises(ValueError, match="sc"):
         master_patterns("sc")
     with pytest.raises(ValueError, match="emissions"):
-        ae.analysis.master_pattern(run, [ae.Unperturbed()])
+        ae.fit.master_pattern(run, [ae.Unperturbed()])
     with pytest.raises(ValueError, match="runs"):
-        ae.analysis.master_pattern([3])
+        ae.fit.master_pattern([3])
     with pytest.raises(ValueError, match="rolled"):
         pattern.map(ae.Orientation("Ni"), ae.detection.Projection(50.0), 60.0, ions=10, rolled=2.0)
     with pytest.raises(ValueError, match="densities"):

@@ -10,6 +10,8 @@ from apt_evap.plot.report.composition_report import composition_section
 from apt_evap.plot.report.html_page import Page
 from apt_evap.workflows.measured_source import MeasuredSource, source_of
 
+pytestmark = pytest.mark.usefixtures("spectra_once")
+
 
 @pytest.fixture
 def hits():

@@ -17,8 +17,6 @@ from matplotlib.text import Text
 
 import apt_evap as ae
 from apt_evap import plot
-from apt_evap.analysis.charge_states import charge_history, charge_state_ratio_map, ion_charges
-from apt_evap.analysis.voltage_history import evaporation_voltages, smoothed_history
 from apt_evap.maps.profiles import Profile
 from apt_evap.plot._figure import set_log_ticks
 from apt_evap.plot.map_figures import specimen_title
@@ -26,6 +24,8 @@ from apt_evap.plot.profile_figures import rectangles
 from apt_evap.plot.responses import ion_colors
 from apt_evap.plot.specimen_figures import mark_atoms
 from apt_evap.reconstruction.consistency import density_near_axis
+from apt_evap.simulation.voltage_history import evaporation_voltages, smoothed_history
+from apt_evap.spectra.charge_states import charge_history, charge_state_ratio_map, ion_charges
 
 
 @pytest.fixture(scope="module")
@@ -587,7 +587,7 @@ def test_response_to_lateral_velocities(run, tmp_path):
     np.testing.assert_array_equal(np.unique(cloud.get_array()), [0, 0.5, 1])
     still = run.hits(ae.Unperturbed())[ions]
     np.testing.assert_allclose(dots.get_offsets(), np.column_stack([still.x, still.y]), atol=1e-9)
-    tracks = ae.analysis.lateral_tracks(run, ions, [1.0], np.arange(0, 360, 2))
+    tracks = ae.simulation.lateral_tracks(run, ions, [1.0], np.arange(0, 360, 2))
     farthest = cloud.get_offsets()[cloud.get_array() == 1]
     np.testing.assert_allclose(farthest[:, 0], tracks.x.ravel(), atol=1e-9)
     np.testing.assert_array_equal(dots.get_facecolors(), [to_rgba(color) for color in ion_colors(3)])
@@ -604,7 +604,7 @@ def test_response_to_rollup(run, tmp_path):
     ax.figure.savefig(tmp_path / "a.png")
     lines = [c for c in ax.collections if isinstance(c, LineCollection)]
     assert len(lines) == 2
-    tracks = ae.analysis.rollup_tracks(run, ions, energies)
+    tracks = ae.simulation.rollup_tracks(run, ions, energies)
     for line, x, y in zip(lines, tracks.x, tracks.y, strict=True):
         segments = np.array([path.vertices for path in line.get_paths()])
         np.testing.assert_allclose(segments[:, 0], np.column_stack([x, y])[:-1])

@@ -102,5 +102,5 @@ def test_the_poles_of_a_run(drawn, nickel):
     run = ae.Simulation(tip, seed=1).run(800, [ae.Unperturbed()], responses=False, progress=False)
     ax, other = (ae.plot.detector_map(run.hits(ae.Unperturbed())) for _ in range(2))
     ae.plot.poles(ax, run)
-    ae.plot.poles(other, ae.Orientation(nickel, (1, 1, 1)), ae.analysis.image_compression(run).projection)
+    ae.plot.poles(other, ae.Orientation(nickel, (1, 1, 1)), ae.simulation.image_compression(run).projection)
     assert len(places(ax)) > 3 and np.array_equal(places(ax), places(other))

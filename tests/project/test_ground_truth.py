@@ -111,6 +111,13 @@ def test_the_interval_of_a_median_covers_it():
     assert 50 <= held <= 60  # of 57
 
 
+def test_the_interval_of_a_median_is_that_of_medians_of_drawn_specimens():
+    errors = [np.arange(k, 3.0 * k + 1) for k in (1, 4, 2, 7)]
+    chosen = np.random.default_rng(0).integers(4, size=(score.DRAWS, 4))
+    medians = [np.median(np.concatenate([errors[k] for k in row])) for row in chosen]
+    assert score.interval(errors) == tuple(np.quantile(medians, (0.025, 0.975)))
+
+
 def test_wrong_answers_are_named(truth):
     folder, _ = truth
     (folder / "bad").mkdir()

@@ -101,9 +101,9 @@ def twins(nickel, made_once):
 
 
 def reconstructed(run, nickel, origins=None):
-    caps = ae.analysis.fit_caps(run)
+    caps = ae.simulation.fit_caps(run)
     radii = np.concatenate([np.full(cap.last - cap.first, cap.radius) for cap in caps])
-    compression = ae.analysis.image_compression(run, caps).compression
+    compression = ae.simulation.image_compression(run, caps).compression
     hits = run.hits(ae.Unperturbed())
     known = {"atomic_volume": nickel.a**3 / 4, "distance": 100.0, "detector_radius": 90.0, "radius": radii}
     return ae.reconstruct(hits, **known, projection="compressed", compression=compression, origins=origins)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import apt_evap as ae
-from apt_evap.analysis.description import describe
+from apt_evap.simulation.description import describe
 
 AL = ae.material("Al")
 SHAPE = {"apex_radius": 3.5, "shank_length": 3.5, "axis": (1, 1, 1)}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis import image_compression
 from apt_evap.detection import Outcome
 from apt_evap.detection.microscope.conductors import simulated_flank
 from apt_evap.detection.microscope.lens import Lens
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.detection.microscope.run_lens import RadiusHistory, RunLens
+from apt_evap.simulation.apex import image_compression
 from apt_evap.units import FLIGHT_TIME
 
 ROLLED = ae.RollUp(0.2)

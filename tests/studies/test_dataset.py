@@ -20,8 +20,8 @@ from sweeps import do
 
 import apt_evap as ae
 from apt_evap._common.files import FileError, sha256_of
-from apt_evap.analysis.apex import fit_caps, image_compression
 from apt_evap.cli.main import main
+from apt_evap.simulation.apex import fit_caps, image_compression
 from apt_evap.simulation.locks import try_lock
 from apt_evap.simulation.run import load
 from apt_evap.studies.dataset.dataset_settings import SPLITS, DatasetSettings

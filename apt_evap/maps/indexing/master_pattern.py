@@ -1,6 +1,6 @@
 """Master patterns: the density of hits in every direction of a crystal, for ions that roll up and for ions that do not.
 
-`apt_evap.analysis.master_pattern` makes a pattern from runs.
+`apt_evap.fit.master_pattern` makes a pattern from runs.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from apt_evap._common.codec import declared, to_plain
-from apt_evap.analysis.description import UNITS, describe
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.fit.study import Study
 from apt_evap.plot.map_figures import detector_map
+from apt_evap.simulation.description import UNITS, describe
 from apt_evap.specimen.materials import Material
 
 _DPI = 90

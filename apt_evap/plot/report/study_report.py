@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 from apt_evap import plot
 from apt_evap._common.types import AnyPath
 from apt_evap._common.validation import check_kind
-from apt_evap.analysis.description import lens_text
 from apt_evap.fit.study import PREDICTED, RULE_OF_METAL, Score, Study
 from apt_evap.maps.crystallography.directions import plain_label
 from apt_evap.plot.report.composition_report import composition_section
@@ -26,6 +25,7 @@ from apt_evap.plot.report.html_page import (
 )
 from apt_evap.plot.report.origin import add_origin, origin
 from apt_evap.plot.report.pictures import blinking_pictures
+from apt_evap.simulation.description import lens_text
 from apt_evap.spectra.mass_spectrum import Spectrum
 
 _COLORS = "viridis"  # of the matrix, as of `plot.score_matrix`

@@ -8,11 +8,11 @@ import numpy as np
 
 from apt_evap._common.codec import for_json, to_plain
 from apt_evap._common.types import Floats
-from apt_evap.analysis.apex import image_compression
 from apt_evap.detection.hits import Hits
 from apt_evap.detection.instrument import Instrument
 from apt_evap.maps.crystallography.directions import poles, zones
 from apt_evap.maps.crystallography.orientation import Orientation
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.config.perturbation_text import read_perturbation
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.lattice import check_axis

@@ -37,7 +37,7 @@ class Receding:
 
 def test_spheres_follow_a_receding_cap():
     run = Receding(1.5)
-    caps = ae.analysis.fit_caps(run)
+    caps = ae.simulation.fit_caps(run)
     assert len(caps) == 10 and caps[0].first == 0 and caps[-1].last == len(run)
     for cap in caps:
         # within a window of 2,000 ions the centre moves by 0.4 nm, the sites stray by 0.06 nm
@@ -48,7 +48,7 @@ def test_spheres_follow_a_receding_cap():
 
 @pytest.mark.parametrize("compression", [1.0, 1.5])
 def test_a_known_compression_comes_back(compression):
-    found = ae.analysis.image_compression(Receding(compression))
+    found = ae.simulation.image_compression(Receding(compression))
     assert found.compression == pytest.approx(compression, rel=0.01)
     assert found.valid_from <= 6 and found.scatter < 0.03  # the sites stray by 0.5 degrees, which is much near the axis
     # the rim of the detector is at 45 degrees, the ions end at 69 degrees on the specimen
@@ -57,7 +57,7 @@ def test_a_known_compression_comes_back(compression):
 
 
 def test_a_compression_on_an_equidistant_detector():
-    found = ae.analysis.image_compression(Receding(1.5, "equidistant"))
+    found = ae.simulation.image_compression(Receding(1.5, "equidistant"))
     assert found.compression == pytest.approx(1.5, rel=0.01)
     assert found.projection == ae.detection.Projection(100 / found.compression)
 
@@ -67,19 +67,19 @@ def test_deep_ions_do_not_move_the_spheres():
     run = Receding(1.5)
     deep = np.random.default_rng(0).random(len(run)) < 0.05
     run.emissions.positions[deep] -= 0.5 * run.emissions.normals[deep]
-    assert ae.analysis.image_compression(run).compression == pytest.approx(1.5, rel=0.003)
+    assert ae.simulation.image_compression(run).compression == pytest.approx(1.5, rel=0.003)
 
 
 def test_without_the_centre_of_the_moment_the_compression_is_wrong():
     run = Receding(1.5)
-    still = [cap._replace(centre=np.zeros(3)) for cap in ae.analysis.fit_caps(run)]
-    assert ae.analysis.image_compression(run, still).compression > 1.6
+    still = [cap._replace(centre=np.zeros(3)) for cap in ae.simulation.fit_caps(run)]
+    assert ae.simulation.image_compression(run, still).compression > 1.6
 
 
 @pytest.mark.slow
 def test_poles_fall_on_the_dark_spots_of_a_simulated_map(run20):
     """Fewer ions land within 3 degrees of the {024} and {135} poles, which lie off the dark zone lines, than around."""
-    found = ae.analysis.image_compression(run20)
+    found = ae.simulation.image_compression(run20)
     # 1.04 to 1.06 for caps of R = 20 a and 40 a of Ni and Al on shanks of 1 to 2 R
     assert 1.0 < found.compression < 1.1 and found.scatter < 0.05
     orientation = ae.Orientation.from_settings(run20.settings["tip"])
@@ -109,4 +109,4 @@ def test_the_scatter_is_the_standard_deviation_of_the_ratio():
     hits = run._hits
     run._hits = ae.Hits(x=hits.x * factor, y=hits.y * factor, outcome=hits.outcome)
     # 5 % of 1.5; the sites add 1 to 2 % of the angle, in quadrature; percentiles of 10,000 ions: 1.5 %
-    assert ae.analysis.image_compression(run).scatter == pytest.approx(0.075, rel=0.08)
+    assert ae.simulation.image_compression(run).scatter == pytest.approx(0.075, rel=0.08)

@@ -111,7 +111,7 @@ def tunnel_factor(field: ArrayLike, ionisation_energy: float) -> Any:
     --------
     Five per cent of the field of neon are a factor of 2.2 of the brightness:
 
-    >>> from apt_evap.analysis.ion_image import tunnel_factor
+    >>> from apt_evap.simulation.ion_image import tunnel_factor
     >>> tunnel = tunnel_factor
     >>> round(tunnel(1.05 * 35.0, 21.565) / tunnel(35.0, 21.565), 1)
     2.2

@@ -13,10 +13,10 @@ import numpy as np
 
 from apt_evap._common.types import Floats
 from apt_evap._common.validation import check_kind, check_sequence
-from apt_evap.analysis.apex import image_compression
 from apt_evap.emission.perturbations import Perturbation
 from apt_evap.maps.crystallography.orientation import Orientation
 from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, sampled
+from apt_evap.simulation.apex import image_compression
 from apt_evap.simulation.run import Run
 from apt_evap.specimen.symmetry import point_group
 

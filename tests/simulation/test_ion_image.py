@@ -9,7 +9,7 @@ import pytest
 import scipy
 
 import apt_evap as ae
-from apt_evap.analysis.ion_image import GASES, _barrier, tunnel_factor
+from apt_evap.simulation.ion_image import GASES, _barrier, tunnel_factor
 
 NEON = GASES["Ne"]
 BARRIER = NEON.ionisation_energy - 4.5
@@ -74,7 +74,7 @@ def sphere():
 def test_a_smooth_sphere_is_uniform(sphere, voltage):
     """V R / r is the potential: the distance, the field and the brightness have closed forms."""
     radius = 6.0
-    local = ae.analysis.field_ion_image(sphere, tunnelling="local", voltage=voltage)
+    local = ae.simulation.field_ion_image(sphere, tunnelling="local", voltage=voltage)
     assert local.voltage == pytest.approx(NEON.field * radius if voltage is None else voltage, rel=1e-9)
     far = radius * local.voltage / (local.voltage - BARRIER)
     field = local.voltage * radius / far**2
@@ -86,14 +86,14 @@ def test_a_smooth_sphere_is_uniform(sphere, voltage):
     assert local.brightness == pytest.approx(np.full(len(local), expected), rel=17 * 2e-3)
     assert local.brightness.std() < 17 * 1.5e-4 * expected
     # through the barrier: along the normal of each atom, which is not quite radial
-    through = ae.analysis.field_ion_image(sphere, voltage=voltage)
+    through = ae.simulation.field_ion_image(sphere, voltage=voltage)
     outwards = through.starts - through.positions
     cosine = np.einsum("ij,ij->i", outwards, through.positions) / radius / through.distances
     assert through.fields / cosine == pytest.approx(np.full(len(through), BARRIER / (far - radius)), rel=3e-3)
 
 
 def test_a_sphere_is_projected_radially(sphere):
-    image = ae.analysis.field_ion_image(sphere, half_angle=40.0, detector=ae.Detector(distance=50.0, width=200.0))
+    image = ae.simulation.field_ion_image(sphere, half_angle=40.0, detector=ae.Detector(distance=50.0, width=200.0))
     angle = np.arctan2(np.hypot(*image.starts[:, :2].T), image.starts[:, 2])
     seen = np.arctan(np.hypot(image.x, image.y) / 50.0)
     assert image.shown.all()
@@ -114,14 +114,14 @@ def evolved(nickel):
 
 @pytest.mark.parametrize("gas", ["He", "Ne", "Ar"])
 def test_kinks_are_brighter_than_ledges_and_terraces(evolved, gas):
-    image = ae.analysis.field_ion_image(evolved, gas, half_angle=20.0)  # around the (111) pole
+    image = ae.simulation.field_ion_image(evolved, gas, half_angle=20.0)  # around the (111) pole
     order = np.argsort(evolved.atoms)
     bonds = evolved.bonds[order[np.searchsorted(evolved.atoms[order], image.atoms)]]
     # fcc (111): 6 nearest neighbours at a kink, 7 at a straight ledge, 9 on a terrace
     kink, ledge, terrace = (np.median(image.brightness[bonds == number]) for number in (6, 7, 9))
     assert kink > 1.3 * ledge and ledge > 5 * terrace
     assert 10 < kink / terrace < 1000
-    local = ae.analysis.field_ion_image(evolved, gas, half_angle=20.0, tunnelling="local")
+    local = ae.simulation.field_ion_image(evolved, gas, half_angle=20.0, tunnelling="local")
     medians = [np.median(local.brightness[bonds == number]) for number in (6, 7, 9)]
     assert max(medians) / min(medians) < 2  # the field on the critical surface does not tell the sites apart
 
@@ -129,7 +129,7 @@ def test_kinks_are_brighter_than_ledges_and_terraces(evolved, gas):
 @pytest.mark.slow
 def test_rings_about_the_pole(tip20):
     """Terraces from the pole to the angle psi: R (1 - cos(psi)) / d."""
-    image = ae.analysis.field_ion_image(ae.evaporation.Emitter(tip20), half_angle=58.0)
+    image = ae.simulation.field_ion_image(ae.evaporation.Emitter(tip20), half_angle=58.0)
     radius, spacing = tip20.apex, tip20.elements[0].a / math.sqrt(3)
     bright = image.brightness > np.median(image.brightness)
     for psi, name in ((30.0, 4.6), (40.0, 8.1), (54.7, 14.6)):
@@ -153,9 +153,9 @@ def test_rings_about_the_pole(tip20):
 def test_one_removed_atom_changes_its_neighbours_only(nickel):
     tip = ae.Tip(nickel, apex_radius=12 * nickel.a, axis=(1, 1, 1), shank_length=12 * nickel.a, offset_seed=3)
     emitter = ae.evaporation.Emitter(tip)
-    before = ae.analysis.field_ion_image(emitter, voltage=200.0)
+    before = ae.simulation.field_ion_image(emitter, voltage=200.0)
     batch = emitter.evaporate(1)
-    after = ae.analysis.field_ion_image(emitter, voltage=200.0)
+    after = ae.simulation.field_ion_image(emitter, voltage=200.0)
     site = tip.positions[batch.site[0]]
     assert batch.site[0] in before.atoms and batch.site[0] not in after.atoms
     common, first, second = np.intersect1d(before.atoms, after.atoms, return_indices=True)
@@ -168,7 +168,7 @@ def test_one_removed_atom_changes_its_neighbours_only(nickel):
 
 
 def test_ions_follow_the_brightness(evolved):
-    image = ae.analysis.field_ion_image(evolved, half_angle=30.0)
+    image = ae.simulation.field_ion_image(evolved, half_angle=30.0)
     hits = image.hits(40_000, seed=4)
     shown = image.shown
     expected = 40_000 * image.brightness[shown] / image.brightness[shown].sum()
@@ -184,7 +184,7 @@ def test_ions_follow_the_brightness(evolved):
 
 
 def test_the_map_has_the_brightness_of_the_spots(evolved):
-    image = ae.analysis.field_ion_image(evolved, half_angle=30.0)
+    image = ae.simulation.field_ion_image(evolved, half_angle=30.0)
     shown = image.map(300)
     assert shown.values.sum() * np.prod(shown.bin_size) == pytest.approx(image.brightness[image.shown].sum(), rel=1e-3)
     close = image.map(200, extent=60.0)
@@ -194,17 +194,17 @@ def test_the_map_has_the_brightness_of_the_spots(evolved):
 
 def test_supply_and_gas(evolved):
     even, capture = (
-        ae.analysis.field_ion_image(evolved, supply=supply, half_angle=10.0) for supply in ("constant", "capture")
+        ae.simulation.field_ion_image(evolved, supply=supply, half_angle=10.0) for supply in ("constant", "capture")
     )
-    local = ae.analysis.field_ion_image(evolved, tunnelling="local", half_angle=10.0).fields
+    local = ae.simulation.field_ion_image(evolved, tunnelling="local", half_angle=10.0).fields
     assert capture.brightness / even.brightness == pytest.approx((local / 35.0) ** 2)
-    own = ae.analysis.field_ion_image(
-        evolved, ae.analysis.ImagingGas("Kr", 14.0, 15.0), half_angle=10.0, detector=ae.Detector(200.0, 500.0)
+    own = ae.simulation.field_ion_image(
+        evolved, ae.simulation.ImagingGas("Kr", 14.0, 15.0), half_angle=10.0, detector=ae.Detector(200.0, 500.0)
     )
     assert own.settings["gas"]["name"] == "Kr" and own.settings["image_field"] == 15.0
     assert own.voltage == pytest.approx(even.voltage * 15 / 35)
     assert pickle.loads(pickle.dumps(own)).settings == copy.deepcopy(own).settings == own.settings
-    weak = ae.analysis.field_ion_image(evolved, image_field=30.0, half_angle=10.0)
+    weak = ae.simulation.field_ion_image(evolved, image_field=30.0, half_angle=10.0)
     assert weak.brightness.sum() < 0.15 * even.brightness.sum()  # (30 / 35)^17 = 0.07
 
 
@@ -223,4 +223,4 @@ def test_supply_and_gas(evolved):
 def test_wrong_arguments(nickel, options, sentence):
     tip = ae.Tip(nickel, apex_radius=2.2, axis=(1, 1, 1), shank_length=2.2, origin=(0.1, 0.2, 0.05))
     with pytest.raises(ValueError, match=sentence):
-        ae.analysis.field_ion_image(ae.evaporation.Emitter(tip), **options)
+        ae.simulation.field_ion_image(ae.evaporation.Emitter(tip), **options)

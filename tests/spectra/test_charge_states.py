@@ -9,7 +9,9 @@ import pytest
 from scipy import stats
 
 import apt_evap as ae
-from apt_evap.analysis.charge_states import (
+from apt_evap.emission.post_ionisation import PostIonisation, charge_state_ratio, field_of_ratio
+from apt_evap.specimen.isotopes import ISOTOPES, mean_mass
+from apt_evap.spectra.charge_states import (
     charge_history,
     charge_state_ratio_history,
     charge_state_ratio_map,
@@ -17,8 +19,6 @@ from apt_evap.analysis.charge_states import (
     ion_charges,
     ratio_of_counts,
 )
-from apt_evap.emission.post_ionisation import PostIonisation, charge_state_ratio, field_of_ratio
-from apt_evap.specimen.isotopes import ISOTOPES, mean_mass
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 NICKEL = """[Ions]

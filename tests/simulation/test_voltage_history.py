@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import apt_evap as ae
-from apt_evap.analysis.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
+from apt_evap.simulation.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 
 
 @pytest.fixture(scope="module")
