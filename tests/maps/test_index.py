@@ -216,6 +216,18 @@ def test_the_matrix_of_a_rotation_vector(size):
     assert rotation_of(vector) == pytest.approx(Rotation.from_rotvec(vector).as_matrix(), abs=1e-15)
 
 
+def test_the_error_at_the_centre_is_that_of_the_rim_and_of_the_stretch():
+    """Against draws of both with their covariance."""
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    disc = disc_of(map)
+    fit = refine(bins_of(disc), disc, master_patterns("fcc")[0].smoothed(0.7), np.eye(3), SCALE, steps=1)
+    covariance = np.zeros((5, 5))
+    covariance[3:, 3:] = 1e-6 * np.array([[9.0, -20.0], [-20.0, 100.0]])
+    fit = replace(fit, scale=48.0, stretch=0.2, covariance=covariance, dispersion=2.0)
+    rim, stretch = np.random.default_rng(8).multivariate_normal((np.log(48.0), 0.2), 2 * covariance[3:, 3:], 100_000).T
+    assert fit.scale_error == pytest.approx(np.std(np.exp(rim) / (1 - stretch)), rel=0.01)
+
+
 @pytest.mark.slow
 def test_the_error_of_the_scale_by_noise_is_its_scatter():
     """The pattern is right: scales of 24 draws, with a lens, have the scatter that one of them predicts."""
