@@ -43,6 +43,7 @@ class CandidateRecord:
     pattern_radius: float = number("Radius of the tip of the pattern", above=0, unit="nm")
     barrel: float = number("Barrel term of the lens", default=0.0, unit="1/rad^2")
     rim_change: float = number("Relative change of the scale from the centre to the rim", default=0.0)
+    scale_error: float | None = number("Standard error of the scale", default=None, at_least=0, unit="mm/rad")
 
 
 @settings

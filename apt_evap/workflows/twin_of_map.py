@@ -65,6 +65,7 @@ _BINS = 128  # of a map of ions
 _REPORTING = 14.0
 _LEAST_PART = 0.2  # of the time is for the simulation, however long the fit takes
 _PART = 0.5  # of the time is for the simulation where the radius is chosen; it had 0.57 to 0.78 of three minutes
+_COPIED = "score", "confidence", "rolled", "contrast", "angle_error", "rim_change", "scale_error"  # of a candidate
 _SPARE = 4.0  # times the ions that the estimate allows are asked for, because the clock ends the run
 
 
@@ -139,10 +140,7 @@ class Twin:
                 orientation=Orientation(crystal, best.axis, best.rotation),
                 projection=Projection(best.scale, best.centre, barrel=best.barrel),
                 pattern=min(patterns, key=lambda pattern: abs(pattern.apex_radius - best.pattern_radius)),
-                **{
-                    name: getattr(best, name)
-                    for name in ("score", "confidence", "rolled", "contrast", "angle_error", "rim_change")
-                },
+                **{name: getattr(best, name) for name in _COPIED},
             )
         except ValueError as error:
             raise FileError(f"{str(self.folder / FACTS)!r} is not a result of apt-evap twin: {error}") from None

@@ -5,6 +5,7 @@
     python twins.py RUNS index Pt --draw 1 --maps 4 --ions 20000    # other maps, of 20,000 ions or more
     python twins.py RUNS bicrystals Pt --maps 2                     # two grains in a map, the second 5 to 50 % of it
     python twins.py RUNS structureless --maps 20                    # rings, gradients, stripes, spots
+    python twins.py RUNS lenses Pt --maps 10                        # scale and its error, of lenses of -20 to 20 %
 
 The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
 symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
@@ -54,6 +55,8 @@ EMISSIONS = (
     ae.RollUp(ae.TruncatedNormal(0.1, 0.1), 1.0, 0.8, 0.1),
 )
 MIXTURES = ((1, 3), (0, 1, 2), (3, 4), (0, 1, 2, 3, 4), (1, 2, 3, 4))
+LENSES = (-0.2, -0.1, 0.0, 0.1, 0.2)
+"""Relative displacements of the rim towards the centre."""
 CONE = math.radians(52)
 """Largest angle from the axis of a run of the ions that are used."""
 
@@ -122,6 +125,22 @@ class Crystal:
         places = np.concatenate([places[random.permutation(len(places))[: n - background]], noise])
         detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
         return detector_map, projection, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees"
+
+    def through_lens(self, seed, change, least):
+        """A map through a lens, of 22 to 36 degrees, its projection, rotation, and what it is."""
+        random = np.random.default_rng(seed)
+        turn = Rotation.random(random_state=int(random.integers(1 << 31))).as_matrix()
+        half_angle, scale = math.radians(random.uniform(22, 36)), random.uniform(30, 80)
+        kind = int(random.integers(len(EMISSIONS) + len(MIXTURES)))
+        kinds = [kind] if kind < len(EMISSIONS) else MIXTURES[kind - len(EMISSIONS)]
+        share = random.uniform(0.2, 0.8, len(kinds)) if len(kinds) > 1 else np.ones(1)
+        lens = ae.detection.Projection(scale, barrel=change / half_angle**2)
+        places = self.places(random, turn, kinds, share, lens, half_angle)
+        places = places[np.hypot(*places.T) < scale * half_angle * (1 - change)]
+        n = int(min(len(places), math.exp(random.uniform(math.log(least), math.log(60_000)))))
+        places = places[random.permutation(len(places))[:n]]
+        detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
+        return detector_map, lens, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees, lens {change:+.0%}"
 
     def places(self, random, turn, kinds, share, projection, half_angle):
         """Places of the ions of a crystal with a rotation, with the same density in all directions."""
@@ -203,11 +222,29 @@ def indexed(name, detector_map, material, what, errors_of=None):
     print(f"{name}: {ions}, {what}: {result.verdict:9}{off} {seconds:4.1f} s; {result.reason}", flush=True)
 
 
+def scale_of_lens(name, detector_map, material, what, lens, turn):
+    """Deviation of the scale at the centre of the true orientation, and its error, relative to the true scale."""
+    found = ae.index(detector_map, material, start=(ae.Orientation.from_matrix(material, turn), lens)).best
+    off, error = found.projection.scale / lens.scale - 1, found.scale_error / lens.scale
+    rim = f"rim {found.rim_change:+.2f}"
+    print(f"{name}: {detector_map.ions:7,} ions, {what}: scale {off:+.1%} ± {error:.1%}, {rim}", flush=True)
+    return off, error
+
+
+def coverage(scales):
+    """Print how far scales are off, and how often their errors contain the truth."""
+    off, error = np.abs(scales).T
+    print(
+        f"{len(off)} maps: RMS {np.sqrt((off**2).mean()):.1%}, within 3 % {(off < 0.03).mean():.0%}, median error "
+        f"{np.median(error):.1%}, within one error {(off < error).mean():.0%}, two {(off < 2 * error).mean():.0%}"
+    )
+
+
 def main():
     """Simulate, or index."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder of the runs")
-    parser.add_argument("what", choices=("simulate", "index", "bicrystals", "structureless"))
+    parser.add_argument("what", choices=("simulate", "index", "bicrystals", "structureless", "lenses"))
     parser.add_argument("elements", nargs="*", metavar="ELEMENT", help=", ".join(TIPS))
     parser.add_argument("--wrong", action="store_true", help="index as another crystal structure")
     parser.add_argument("--maps", type=int, default=8, help="maps of each tip, or without structure")
@@ -222,6 +259,7 @@ def main():
             element = elements[number % len(elements)]
             indexed(f"{number} as {element}", detector_map, element, what)
         return
+    scales = []
     for element in elements:
         path = options.runs / f"{element}_{TIPS[element][0]}.h5"
         if options.what == "simulate":
@@ -230,6 +268,13 @@ def main():
             continue
         crystal = Crystal(ae.load(path))
         material = crystal.orientation.material
+        if options.what == "lenses":
+            for number in range(options.maps):
+                seed = 10_000 * options.draw + 100 * TIPS[element][4] + 70 + number
+                detector_map, lens, turn, what = crystal.through_lens(seed, LENSES[number % 5], options.ions)
+                name = f"{element} {TIPS[element][0]} a, map {number}"
+                scales.append(scale_of_lens(name, detector_map, material, what, lens, turn))
+            continue
         for number in range(options.maps):
             seed, second = 10_000 * options.draw + 100 * TIPS[element][4] + number, 0.0
             if options.what == "bicrystals":
@@ -243,6 +288,8 @@ def main():
                 what,
                 partial(crystal.error, detector_map, projection=projection, turn=turn),
             )
+    if scales:
+        coverage(np.array(scales))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import zones
@@ -15,9 +16,10 @@ from apt_evap.maps.indexing.contrast_search import (
     exact_evidence,
     local_contrast,
     refine_contrast,
+    terms_of,
 )
 from apt_evap.maps.indexing.joint_search import CONTRAST, JointSearch
-from apt_evap.maps.indexing.master_pattern import master_patterns
+from apt_evap.maps.indexing.master_pattern import master_patterns, nearest_pixels
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, misorientation
 from apt_evap.maps.indexing.refine import directions_of
 from apt_evap.specimen.symmetry import point_group
@@ -165,3 +167,31 @@ def test_a_measured_map_of_nickel_is_decided():
     poles = best.projection.places(best.orientation.directions(GROUP @ np.ones(3)))
     assert np.nanmin(np.hypot(*(poles - (-9.6, -0.4)).T)) < 1.5
     assert best.projection.scale == pytest.approx(25.8, rel=0.1)
+
+
+def test_the_filter_is_a_gaussian():
+    """By products with matrices, against the filter of SciPy."""
+    values, mask = np.random.default_rng(5).random((3, 40, 60)), np.hypot(*(np.indices((40, 60)) - 20)) < 19
+    along = 2.0, 3.3
+    sums, area = (
+        scipy.ndimage.gaussian_filter(image, sigma, mode="constant", truncate=3.0)
+        for image, sigma in ((values * mask, (0, *along)), (mask.astype(float), along))
+    )
+    assert module._mean(values, mask, along) == pytest.approx(sums / np.maximum(area, 1e-6), rel=1e-12)
+
+
+@pytest.mark.parametrize("element", ["Ni", "Ti"])
+def test_equal_directions_are_in_one_triangle(element):
+    """Equal by the symmetry of the crystal; one for all directions that are equal; on the pixels that are kept."""
+    terms, group = terms_of(ae.material(element)), point_group(ae.material(element).structure)
+    directions = np.random.default_rng(6).normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    equal = terms.equal(directions)
+    apart = np.linalg.norm(np.einsum("gij,nj->gni", group, directions) - equal, axis=2)
+    assert apart.min(axis=0).max() < 1e-12
+    for member in group:
+        assert terms.equal(directions @ member.T) == pytest.approx(equal, abs=1e-12)
+    rows, columns = np.subtract(nearest_pixels(equal), np.reshape(terms.corner, (2, 1)))
+    shape = terms.images(0.5).shape[1:]
+    assert rows.min() >= 0 and columns.min() >= 0 and rows.max() < shape[0] and columns.max() < shape[1]
+    assert np.prod(shape) < 0.15 * 321**2  # a part of the disc

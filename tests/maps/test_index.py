@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import plane_normals
+from apt_evap.maps.indexing import joint_search
 from apt_evap.maps.indexing import orientation_search as polar_pictures
 from apt_evap.maps.indexing.contrast_search import picture_of, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
@@ -25,7 +26,7 @@ from apt_evap.maps.indexing.orientation_search import (
     flattened_by_rings,
     misorientation,
 )
-from apt_evap.maps.indexing.refine import bins_of, deviance, refine
+from apt_evap.maps.indexing.refine import bins_of, deviance, refine, rotation_of
 from apt_evap.maps.indexing.two_criteria import angle_between
 from apt_evap.specimen.symmetry import point_group
 
@@ -199,6 +200,49 @@ def test_the_search_is_the_direct_correlation():
     # the search takes the nearest pixel of the pattern, here it is interpolated
     correlation = np.sqrt(1 - np.exp(-start.score / COUNTS))
     assert correlation == pytest.approx(direct, abs=0.03) and start.scale == pytest.approx(58.0)
+
+
+def test_spectra_of_both_hands():
+    random = np.random.default_rng(7)
+    spectra, picture = (random.normal(size=(*shape, 2)) @ (1, 1j) for shape in ((4, 3, 20, 49), (20, 49)))
+    as_it_is, mirrored = joint_search._products(spectra, picture).swapaxes(0, 1)
+    assert as_it_is == pytest.approx((spectra * picture.conj()).sum(axis=2).conj())
+    assert mirrored == pytest.approx((spectra * picture).sum(axis=2))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 2.0])
+def test_the_matrix_of_a_rotation_vector(size):
+    vector = size * np.array([0.48, -0.6, 0.64])
+    assert rotation_of(vector) == pytest.approx(Rotation.from_rotvec(vector).as_matrix(), abs=1e-15)
+
+
+def test_the_error_at_the_centre_is_that_of_the_rim_and_of_the_stretch():
+    """Against draws of both with their covariance."""
+    _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
+    disc = disc_of(map)
+    fit = refine(bins_of(disc), disc, master_patterns("fcc")[0].smoothed(0.7), np.eye(3), SCALE, steps=1)
+    covariance = np.zeros((5, 5))
+    covariance[3:, 3:] = 1e-6 * np.array([[9.0, -20.0], [-20.0, 100.0]])
+    fit = replace(fit, scale=48.0, stretch=0.2, covariance=covariance, dispersion=2.0)
+    rim, stretch = np.random.default_rng(8).multivariate_normal((np.log(48.0), 0.2), 2 * covariance[3:, 3:], 100_000).T
+    assert fit.scale_error == pytest.approx(np.std(np.exp(rim) / (1 - stretch)), rel=0.01)
+
+
+@pytest.mark.slow
+def test_the_error_of_the_scale_by_noise_is_its_scatter():
+    """The pattern is right: scales of 24 draws, with a lens, have the scatter that one of them predicts."""
+    lens = ae.detection.Projection(SCALE, barrel=0.3)  # 10 % at the rim
+    densities = master_patterns("fcc")[0].smoothed(0.7)
+    scales, errors = [], []
+    for seed in range(24):
+        orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0, projection=lens, seed=seed)
+        disc = disc_of(map)
+        fit = refine(bins_of(disc), disc, densities, orientation.matrix, SCALE, prior=0.1)
+        scales.append(fit.scale_at_centre)
+        errors.append(fit.scale_error)
+    # the error of a standard deviation of 24 is 15 %
+    assert np.std(scales, ddof=1) == pytest.approx(np.median(errors), rel=0.45)
+    assert np.mean(scales) == pytest.approx(SCALE, abs=3 * np.median(errors) / np.sqrt(24))
 
 
 def test_refinement_never_lowers_the_likelihood():

@@ -33,7 +33,7 @@ from apt_evap._common.types import Floats
 from apt_evap.maps.crystallography.directions import poles, zones
 from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, MasterPattern, master_patterns, nearest_pixels, sampled
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Disc, Start, polar_grid
-from apt_evap.maps.indexing.refine import LARGEST_STRETCH, STRETCH, directions_of
+from apt_evap.maps.indexing.refine import LARGEST_STRETCH, STRETCH, directions_of, rotation_of
 from apt_evap.specimen.materials import Material, as_material
 
 NARROW, WIDE = 0.035, 0.12
@@ -44,6 +44,7 @@ PATTERN, LINES, POLES = 0.6, 1.0, 0.8
 """Standard deviations of the priors of the amplitudes, for terms and picture of a variance of 1."""
 _TYPICAL = {"fcc": "Ni", "bcc": "W", "diamond": "Si"}
 _FLOOR = 0.5  # of the median of the local standard deviation: smaller ones are set to this
+_TANGENT, _SINE = math.sqrt(1 / 3), math.sqrt(3 / 4)  # of 30 and of 60 degrees
 _FLAT = 1e-6  # contrast of an image that has none
 _FAMILIES = 5  # of poles
 _LINE_WIDTH = np.radians(2.0)  # standard deviation: wider than most lines, for the steps of the search
@@ -72,15 +73,25 @@ def local_contrast(
 
 def _mean(values, mask, sigma):
     """Mean of the pixels that count in a Gaussian of these standard deviations."""
-    along = (*np.zeros(values.ndim - 2), *np.broadcast_to(sigma, 2))
+    along = [float(width) for width in np.broadcast_to(sigma, 2)]
     values = np.where(mask, values, values.dtype.type(0)).astype(np.result_type(values, np.float32), copy=False)
-    sums = scipy.ndimage.gaussian_filter(values, along, mode="constant", truncate=3.0)
-    area = scipy.ndimage.gaussian_filter(mask.astype(values.dtype), sigma, mode="constant", truncate=3.0)
-    return sums / np.maximum(area, 1e-6)
+    rows, columns = (_gaussian(size, width, values.dtype) for size, width in zip(mask.shape, along, strict=True))
+    return (rows @ values @ columns) / np.maximum(rows @ mask.astype(values.dtype) @ columns, 1e-6)
 
 
+@lru_cache(maxsize=64)
+def _gaussian(size, sigma, dtype):
+    """Weights of a Gaussian filter of three standard deviations [pixels] along an axis, shape (size, size)."""
+    reach = int(3 * sigma + 0.5)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    weights /= weights.sum()
+    apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    return np.where(apart <= reach, weights[np.minimum(apart, reach) + reach], 0.0).astype(dtype)
+
+
+@lru_cache(maxsize=1)
 def places_of() -> tuple[Floats, Floats]:
-    """Points of a polar picture in radii of the disc, (n, 2), and their areas, (n,)."""
+    """Points of a polar picture in radii of the disc, (n, 2), and their areas, (n,); not to be changed."""
     radii, azimuths = polar_grid(RINGS, AZIMUTHS)
     r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
     return np.column_stack([r * np.cos(phi), r * np.sin(phi)]), r / r.sum()
@@ -135,7 +146,10 @@ class Terms:
         """Which amplitudes may be negative, shape (k,)."""
         self.structure = material.structure
         """Crystal structure."""
-        if self.structure != "hcp":  # those of one triangle, see `equal`
+        # those of one triangle, see `equal`
+        if self.structure == "hcp":
+            self._used = self._inside & (y >= 0) & (y <= x * _TANGENT)
+        else:
             self._used = (directions[..., 0] >= 0) & (np.diff(directions, axis=-1) >= 0).all(axis=-1)
         # what is used, with the pixels beside it
         self._rows, self._columns = (
@@ -164,13 +178,16 @@ class Terms:
         row, column = nearest_pixels(self.equal(directions))
         images = self.images(half_angle)
         flat = images.reshape(len(images), -1)
-        return flat[:, (row - self.corner[0]) * images.shape[2] + column - self.corner[1]], np.stack([row, column])
+        pixels = (row - self.corner[0]) * images.shape[2] + column - self.corner[1]
+        return flat.take(pixels, axis=1), np.stack([row, column])
 
     def equal(self, directions: Floats) -> Floats:
         """Equal directions; of cubic crystals those next to [001], where the pixels are least distorted."""
-        if self.structure == "hcp":
-            return directions
         x, y, z = np.abs(directions).T
+        if self.structure == "hcp":  # an azimuth of 0 to 30 degrees: mirrored at 30 degrees, then at 0
+            beyond = y > x * _TANGENT
+            first, second = x / 2 + _SINE * y, np.abs(_SINE * x - y / 2)
+            return np.stack([np.where(beyond, first, x), np.where(beyond, second, y), z], axis=1)
         low, high = np.minimum(x, y), np.maximum(x, y)
         return np.stack([np.minimum(low, z), np.maximum(low, np.minimum(high, z)), np.maximum(high, z)], axis=1)
 
@@ -198,17 +215,17 @@ def terms_of(material: Material) -> Terms:
     return Terms(material, master_patterns(material.structure))
 
 
-def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> Floats:
+def evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray, pieces: float = PIECES) -> Floats:
     """Evidence E of m pictures for k terms of a model, shape (..., m), see the module.
 
     `gram` has the products G of the terms, means over the disc, (..., k, k), `cross` those with pictures of a variance
     of 1, (..., k, m), `priors` the standard deviations of the amplitudes. Amplitudes of the largest likelihood that may
     not be negative (`signed`) and are, are set to 0, the others are kept: what is explained is then at least this.
     """
-    ridge = gram + np.diag(1 / (PIECES * priors**2))
+    ridge = gram + np.diag(1 / (pieces * priors**2))
     amplitudes = np.linalg.solve(ridge, cross)
     amplitudes = np.where(signed[:, None], amplitudes, np.maximum(amplitudes, 0))
-    return _evidence(ridge, cross, priors, amplitudes)
+    return _evidence(ridge, cross, priors, amplitudes, pieces)
 
 
 def exact_evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarray) -> tuple[float, Floats]:
@@ -222,10 +239,10 @@ def exact_evidence(gram: Floats, cross: Floats, priors: Floats, signed: np.ndarr
     return float(_evidence(ridge, cross[:, None], priors, amplitudes[:, None])[0]), amplitudes
 
 
-def _evidence(ridge, cross, priors, amplitudes):
+def _evidence(ridge, cross, priors, amplitudes, pieces=PIECES):
     explained = (amplitudes * (2 * cross - ridge @ amplitudes)).sum(axis=-2)
-    volume = np.linalg.slogdet(PIECES * priors[:, None] * ridge * priors)[1]  # of 1 + N S G S
-    return -PIECES * np.log1p(-np.clip(explained, 0, 0.999)) - volume[..., None]
+    volume = np.linalg.slogdet(pieces * priors[:, None] * ridge * priors)[1]  # of 1 + N S G S
+    return -pieces * np.log1p(-np.clip(explained, 0, 0.999)) - volume[..., None]
 
 
 class Explained(NamedTuple):
@@ -252,14 +269,17 @@ def refine_contrast(
     limits = np.log(bounds)
     local: dict[tuple[float, float], Floats] = {}
 
-    def sample(images, geometry):
-        turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
+    def directions(geometry):
         key = float(geometry[3]), float(geometry[4])
         if key not in local:  # rotations do not change them
             local.clear()
             local[key] = directions_of(places, radius, math.exp(geometry[3]), geometry[4])
-        directions = local[key] @ turn
-        pictures = sampled(images, terms.equal(directions), terms.corner)
+        return local[key] @ (rotation_of(geometry[:3]) @ start.matrix)
+
+    def sample(images, *geometries):
+        """Pictures of one image for several geometries, or of several images for one."""
+        at = np.concatenate([directions(geometry) for geometry in geometries])
+        pictures = sampled(images, terms.equal(at), terms.corner).reshape(-1, len(places))
         return pictures - (pictures @ areas)[:, None]
 
     def judged(geometry):
@@ -275,8 +295,8 @@ def refine_contrast(
     value, amplitudes, model = judged(geometry)
     for _ in range(_STEPS):
         image = np.tensordot(amplitudes.astype(np.float32), terms.images(radius / math.exp(geometry[3])), 1)[None]
-        here = sample(image, geometry)[0]
-        slopes = np.stack([(sample(image, geometry + s)[0] - here) / _DIFFERENCE for s in _DIFFERENCE * np.eye(5)])
+        here, *moved_by = sample(image, geometry, *(geometry + _DIFFERENCE * np.eye(5)))
+        slopes = (np.stack(moved_by) - here) / _DIFFERENCE
         left = picture - model
         prior = np.array([0, 0, 0, 0, max(areas @ left**2, 1e-3) / (PIECES * STRETCH**2)])
         normal = (slopes * areas) @ slopes.T
@@ -293,5 +313,4 @@ def refine_contrast(
         if new[0] <= value + _FINE:
             break
         geometry, (value, amplitudes, model) = moved, new
-    turn = scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ start.matrix
-    return Explained(turn, math.exp(geometry[3]), float(geometry[4]), value)
+    return Explained(rotation_of(geometry[:3]) @ start.matrix, math.exp(geometry[3]), float(geometry[4]), value)

@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from apt_evap._common.types import Floats
-from apt_evap.maps.indexing.contrast_search import PIECES, Terms, exact_evidence, places_of, refine_contrast
+from apt_evap.maps.indexing.contrast_search import PIECES, Terms, evidence, exact_evidence, places_of, refine_contrast
 from apt_evap.maps.indexing.joint_search import JOINT, JointSearch
 from apt_evap.maps.indexing.master_pattern import sampled
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, Start, about_axis, axes_of, polar_grid
@@ -81,13 +81,7 @@ def _in_windows(picture, windows):
 
 def _evidence(terms, gram, cross):
     """Evidence of half a picture for products of terms, shape (..., k, k), and with it, shape (..., k)."""
-    pieces = PIECES / 2
-    ridge = gram + np.diag(1 / (pieces * terms.priors**2))
-    volume = np.linalg.slogdet(pieces * terms.priors[:, None] * ridge * terms.priors)[1]
-    amplitudes = np.linalg.solve(ridge, cross[..., None])[..., 0]
-    amplitudes = np.where(terms.signed, amplitudes, np.maximum(amplitudes, 0))
-    explained = (amplitudes * (2 * cross - (ridge @ amplitudes[..., None])[..., 0])).sum(axis=-1)
-    return -pieces * np.log1p(-np.clip(explained, 0, 0.999)) - volume
+    return evidence(gram, cross[..., None], terms.priors, terms.signed, PIECES / 2)[..., 0]
 
 
 def _of_winner(view, terms, fit, windows, pictures):
@@ -130,6 +124,8 @@ def _of_others(view, terms, fit, windows, pictures):
     about = np.stack([scipy.spatial.transform.Rotation.from_rotvec((0, 0, angle)).as_matrix() for angle in angles])
     turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, STEP)])
     turns = np.concatenate([turns, np.diag([1.0, -1.0, 1.0]) @ -turns])  # both hands
+    # a pattern that is turned by an azimuth begins the half there before
+    turned = (np.arange(HALVES)[:, None] * (AZIMUTHS // HALVES) - AZIMUTHS // 4 - np.arange(AZIMUTHS)) % AZIMUTHS
     best = np.full(HALVES, -np.inf)
     for first in range(0, len(turns), _AT_ONCE):
         some = turns[first : first + _AT_ONCE]
@@ -146,12 +142,13 @@ def _of_others(view, terms, fit, windows, pictures):
         traces = np.einsum("naij,gjk,ik->nag", matrices, proper, fit.matrix, optimize=True).max(axis=2)
         far = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))) > FAR
         pattern = scipy.fft.rfft(shown, axis=3).conj()
-        for k in range(HALVES):
-            cross = scipy.fft.irfft((pattern * spectra[k]).sum(axis=2), AZIMUTHS, axis=2).swapaxes(1, 2)
-            # a pattern that is turned by an azimuth begins the half there before
-            begin = (k * AZIMUTHS // HALVES - AZIMUTHS // 4 - np.arange(AZIMUTHS)) % AZIMUTHS
-            values = _evidence(terms, gram[:, begin], cross / norms[:, begin])
-            best[k] = max(best[k], values[far].max(initial=-np.inf))
+        # of every half and every azimuth at which the half begins on the pattern: (halves, azimuths, axes, terms)
+        cross = scipy.fft.irfft(np.einsum("nkrf,hrf->nhkf", pattern, spectra), AZIMUTHS, axis=3)
+        cross = cross[:, np.arange(HALVES)[:, None], :, turned] / norms.swapaxes(0, 1)
+        # the products of the terms are those of a half, whichever it is
+        values = evidence(gram, cross.transpose(2, 1, 3, 0), terms.priors, terms.signed, PIECES / 2)
+        values = np.where(far[:, turned].swapaxes(1, 2), values, -np.inf)
+        best = np.maximum(best, values.max(axis=(0, 1)))
     return best
 
 
@@ -230,17 +227,21 @@ def second_grain(view: View, terms: Terms, fit: Refined) -> SecondGrain:
         matrices = about @ some[:, None]
         traces = np.einsum("naij,gjk,ik->nag", matrices, proper, fit.matrix, optimize=True).max(axis=2)
         far = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))) > FAR
-        for k, share in enumerate(shares):
-            # sums over the segment for every azimuth of the pattern
-            cross, inside, power = (
-                scipy.fft.irfft((spectrum * part).sum(axis=1), AZIMUTHS, axis=1)
-                for spectrum, part in ((plain, of_picture[k]), (plain, of_segments[k]), (squares, of_segments[k]))
-            )
-            gains = 2 * (cross - inside * means[k]) - (power - inside**2 / share)
-            other[k] = max(other[k], weight * gains[far].max(initial=-np.inf))
+        # sums over every segment for every azimuth of the pattern, shape (axes, segments, azimuths)
+        cross, inside = _correlations(plain, of_picture), _correlations(plain, of_segments)
+        power = _correlations(squares, of_segments)
+        gains = 2 * (cross - inside * means[:, None]) - (power - inside**2 / shares[:, None])
+        gains = np.where(far[:, None], gains, -np.inf)
+        other = np.maximum(other, weight * gains.max(axis=(0, 2)))
     best = int(np.argmax(other - winner))
     chord, segment = divmod(best, SEGMENTS)
     return SecondGrain(float((other - winner)[best]), CHORDS[chord], math.degrees(azimuths[segment]))
+
+
+def _correlations(spectra, others):
+    """Sums of products of pictures for every azimuth; spectra (n, rings, f), (m, rings, f) -> (n, m, azimuths)."""
+    products = np.moveaxis(spectra, 2, 0) @ np.moveaxis(others, (2, 1), (0, 1))
+    return scipy.fft.irfft(np.moveaxis(products, 0, 2), AZIMUTHS, axis=2)
 
 
 class Surrogates(NamedTuple):

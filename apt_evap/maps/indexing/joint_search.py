@@ -19,7 +19,7 @@ from apt_evap._common.types import Floats
 from apt_evap.detection.projection import Projection
 from apt_evap.maps.indexing.contrast_search import PIECES, Terms, places_of
 from apt_evap.maps.indexing.marked_poles import Mark, rotations_misfit
-from apt_evap.maps.indexing.master_pattern import MasterPattern
+from apt_evap.maps.indexing.master_pattern import HALF, MasterPattern
 from apt_evap.maps.indexing.orientation_search import (
     AZIMUTHS,
     BRIGHTEST,
@@ -33,7 +33,7 @@ from apt_evap.maps.indexing.orientation_search import (
     flattened,
     oriented,
     polar_grid,
-    slow_changes,
+    slow_of_pictures,
 )
 from apt_evap.maps.indexing.refine import directions_of
 from apt_evap.specimen.symmetry import point_group
@@ -44,6 +44,7 @@ COUNTS = 100.0
 """Independent pieces of the flattened picture of the counts: a correlation r is worth -COUNTS ln(1 - r^2)."""
 CONTRAST, COUNTED, JOINT = range(3)
 """Which of the criteria: the evidence of the contrast, that of the counts, or their sum."""
+_AT_ONCE = 24  # axes whose pictures are made together
 _SORTED = 400  # best points of the grid among which different starts are searched
 
 
@@ -113,41 +114,45 @@ class JointSearch:
 
     def _at_scale(self, disc, contrast, scale):
         """Products of the map with the crystal at a scale, for both hands."""
-        terms, n = self._terms, len(self._turns)
+        counts, n = _spectrum_of_counts(disc, scale), len(self._turns)
+        # what a few axes need stays in the cache of a processor
+        parts = [
+            self._of_axes(self._turns[first : first + _AT_ONCE], disc.radius, scale, contrast, counts)
+            for first in range(0, n, _AT_ONCE)
+        ]
+        joined = (np.concatenate(part) for part in zip(*parts, strict=True))
+        both, both_counts, ridge, volume, norms, inverse_counts = joined
+        single = [values.astype(np.float32) for values in (ridge, np.linalg.inv(ridge), volume)]
+        for k, mirror in enumerate((False, True)):
+            yield _Slice(
+                scale, mirror, both[:, k], *single, both_counts[:, k], norms.astype(np.float32),
+                inverse_counts.astype(np.float32),
+            )  # fmt: skip
+
+    def _of_axes(self, turns, radius, scale, contrast, counts):
+        """The parts of a `_Slice` of some axes, for both hands along the second axis of the spectra."""
+        terms, n = self._terms, len(turns)
         places, areas = places_of()
         areas = areas.astype(np.float32)
-        local = directions_of(places, disc.radius, scale, 0.0)
-        directions = (local @ self._turns).reshape(-1, 3)
-        pictures, (row, column) = terms.at(directions, disc.radius / scale)
+        directions = (directions_of(places, radius, scale, 0.0) @ turns).reshape(-1, 3)
+        pictures, (row, column) = terms.at(directions, radius / scale)
         pictures = pictures.reshape(len(pictures), n, -1).swapaxes(0, 1)
         pictures = pictures - (pictures @ areas)[..., None]
         pictures /= np.maximum(np.sqrt(pictures**2 @ areas), 1e-3)[..., None]
         ridge = ((pictures * areas) @ pictures.swapaxes(1, 2)).astype(float) + np.diag(1 / (PIECES * terms.priors**2))
         volume = np.linalg.slogdet(PIECES * terms.priors[:, None] * ridge * terms.priors)[1]
         spectra = scipy.fft.rfft(pictures.reshape(n, -1, RINGS, AZIMUTHS), axis=3)
-        # the picture of the counts is smoothed by the same angle as the patterns
-        counts = flattened(disc, np.radians(SMOOTHED) * scale)
-        counts = scipy.fft.rfft((counts / max(np.linalg.norm(counts), 1e-12)).astype(np.float32), axis=1)
-        slow, weights = slow_changes(*polar_grid(RINGS, AZIMUTHS))
+        slow, weights = slow_of_pictures()
         slow, root = slow.astype(np.float32), np.sqrt(weights).astype(np.float32)
-        densities = np.concatenate([pattern[:, row, column] for pattern in self._patterns])
+        pixels = row * (2 * HALF + 1) + column
+        densities = np.concatenate([pattern.reshape(2, -1).take(pixels, axis=1) for pattern in self._patterns])
         densities = np.minimum(densities, BRIGHTEST).reshape(-1, n, RINGS * AZIMUTHS).swapaxes(0, 1) * root
         densities = (densities - (densities @ slow) @ slow.T).reshape(n, len(self._patterns), 2, -1)
         products = (densities @ densities.swapaxes(2, 3)).astype(float)
         norms = np.maximum(np.einsum("npkk->npk", products), 1e-30)
         inverse_counts = np.linalg.inv(products + 1e-6 * norms.sum(axis=2)[..., None, None] * np.eye(2))
         of_counts = scipy.fft.rfft(densities.reshape(*densities.shape[:3], RINGS, AZIMUTHS), axis=4)
-        single = [values.astype(np.float32) for values in (ridge, np.linalg.inv(ridge), volume)]
-        for mirror in (False, True):
-            # of the mirrored pattern the spectrum is not conjugated, so of the map it is
-            one, other = (values if mirror else values.conj() for values in (contrast, counts))
-            products = np.einsum("nkrf,rf->nkf", spectra, one), np.einsum("npkrf,rf->npkf", of_counts, other)
-            if not mirror:
-                products = products[0].conj(), products[1].conj()
-            yield _Slice(
-                scale, mirror, products[0], *single, products[1], norms.astype(np.float32),
-                inverse_counts.astype(np.float32),
-            )  # fmt: skip
+        return _products(spectra, contrast), _products(of_counts, counts), ridge, volume, norms, inverse_counts
 
     def _values(self, phases):
         """Both criteria without marks, shape (2, slices, axes, azimuths), with these factors of the harmonics."""
@@ -208,6 +213,24 @@ class JointSearch:
     def largest(self) -> float:
         """Largest value of the joint criterion, without marks."""
         return float(self._criterion(JOINT, None).max())
+
+
+def _products(spectra, picture):
+    """Products of spectra, shape (n, ..., rings, f), with that of a picture, summed over rings, (n, 2, ..., f).
+
+    Both hands: of the mirrored pattern the spectrum is not conjugated, so of the map it is.
+    """
+    # real and imaginary parts apart: four sums for both hands
+    real, imaginary = (np.einsum("...rf,rf->...f", part, picture.real) for part in (spectra.real, spectra.imag))
+    crossed, other = (np.einsum("...rf,rf->...f", part, picture.imag) for part in (spectra.real, spectra.imag))
+    return np.stack([real + other + 1j * (crossed - imaginary), real - other + 1j * (crossed + imaginary)], axis=1)
+
+
+@lru_cache(maxsize=32)
+def _spectrum_of_counts(disc, scale):
+    """Spectrum of the flattened counts of a map, smoothed by the same angle as the patterns; for all structures."""
+    counts = flattened(disc, np.radians(SMOOTHED) * scale)
+    return scipy.fft.rfft((counts / max(np.linalg.norm(counts), 1e-12)).astype(np.float32), axis=1)
 
 
 def _costs(disc, marks, turns, scale):

@@ -187,8 +187,9 @@ def sampled(densities: Floats, directions: Floats, corner: tuple[int, int] = (0,
     down, right = row - top, column - left
     first = top * width + left
     flat = densities.reshape(len(densities), -1)
-    upper = flat[:, first] * (1 - right) + flat[:, first + 1] * right
-    lower = flat[:, first + width] * (1 - right) + flat[:, first + width + 1] * right
+    upper = flat.take(first, axis=1) * (1 - right) + flat.take(first + 1, axis=1) * right
+    first += width
+    lower = flat.take(first, axis=1) * (1 - right) + flat.take(first + 1, axis=1) * right
     return upper * (1 - down) + lower * down
 
 

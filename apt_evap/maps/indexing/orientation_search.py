@@ -5,7 +5,9 @@ transform along the azimuth (`joint_search`). Slow changes across the map are re
 ring, as many instruments have a strong change along the radius, then polynomials of degree four.
 """
 
+import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -170,13 +172,19 @@ def slow_changes(radii: Floats, azimuths: Floats) -> tuple[Floats, Floats]:
     return np.linalg.qr(terms * np.sqrt(weights)[:, None])[0], weights
 
 
+@lru_cache(maxsize=1)
+def slow_of_pictures() -> tuple[Floats, Floats]:
+    """`slow_changes` of the points of a polar picture."""
+    return slow_changes(*polar_grid(RINGS, AZIMUTHS))
+
+
 def flattened(disc: Disc, sigma: float) -> Floats:
     """Polar picture of a map, smoothed by `sigma` [mm], without its slow changes, times the root of the areas.
 
     Shape (RINGS, AZIMUTHS).
     """
     radii, azimuths = polar_grid(RINGS, AZIMUTHS)
-    slow, weights = slow_changes(radii, azimuths)
+    slow, weights = slow_of_pictures()
     smoothed = disc.map.smoothed(max(sigma, _NARROW * disc.radius))
     values = np.where(smoothed.mask, smoothed.values, np.nan)
     r, phi = np.meshgrid(radii * disc.radius, azimuths, indexing="ij")
@@ -229,8 +237,8 @@ def distinct_starts(
     for score, scale, turn, mirror, angle in scored:
         matrix = oriented(turn, mirror, angle)
         if not any(
-            misorientation(matrix, other.matrix, proper) < 2 * axis_step
-            and abs(np.log(scale / other.scale)) < 2.5 * scale_step
+            abs(math.log(scale / other.scale)) < 2.5 * scale_step
+            and misorientation(matrix, other.matrix, proper) < 2 * axis_step
             for other in starts
         ):
             starts.append(Start(matrix, float(scale), float(score)))

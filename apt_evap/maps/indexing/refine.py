@@ -93,12 +93,18 @@ class Refined:
     deviations: np.ndarray
     """Deviation of each mark from what it may be [standard errors], shape (n_marks,)."""
     covariance: np.ndarray
-    """Of the rotation vector [rad] and the logarithm of the scale, shape (4, 4)."""
+    """Of the rotation vector [rad], the logarithm of the scale and the stretch, shape (5, 5)."""
 
     @property
     def scale_at_centre(self) -> float:
         """Scale of the projection [mm/rad]."""
         return self.scale / (1.0 - self.stretch)
+
+    @property
+    def scale_error(self) -> float:
+        """Standard error of `scale_at_centre` [mm/rad], with the dispersion, and with what the stretch leaves open."""
+        slopes = np.array([0.0, 0.0, 0.0, 1.0, 1.0 / (1.0 - self.stretch)])
+        return self.scale_at_centre * math.sqrt(max(slopes @ self.covariance @ slopes, 0.0) * self.dispersion)
 
 
 def resolution(disc: Disc, scale: float) -> float:
@@ -165,6 +171,23 @@ def directions_of(places: Floats, radius: float, scale: float, stretch: float) -
     return np.column_stack([x * across, y * across, np.cos(theta)])
 
 
+def rotation_of(vector: Floats) -> Floats:
+    """Matrix of a rotation vector [rad], shape (3, 3)."""
+    x, y, z = vector.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-8:
+        return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])
+    s, c = math.sin(angle) / angle, 2 * (math.sin(angle / 2) / angle) ** 2
+    xy, yz, zx = c * x * y, c * y * z, c * z * x
+    return np.array(
+        [
+            [1 - c * (y * y + z * z), xy - s * z, zx + s * y],
+            [xy + s * z, 1 - c * (z * z + x * x), yz - s * x],
+            [zx - s * y, yz + s * x, 1 - c * (x * x + y * y)],
+        ]
+    )
+
+
 def _solve(columns, residuals, weights):
     normal = columns.T @ (columns * weights[:, None])
     right = columns.T @ (residuals * weights)
@@ -194,6 +217,8 @@ class _Likelihood:
         As for `refine`.
     geometry : ndarray
         Start. Each mark keeps the target that it has there; one that is far from all of them does not count.
+    prior : float
+        Standard deviation of the prior of the stretch.
     """
 
     def __init__(
@@ -205,8 +230,9 @@ class _Likelihood:
         marks: Sequence[Mark],
         bounds: tuple[float, float] | None,
         geometry: Floats,
+        prior: float,
     ) -> None:
-        self._bins, self._disc, self._densities, self._matrix = bins, disc, densities, matrix
+        self._bins, self._disc, self._densities, self._matrix, self._prior = bins, disc, densities, matrix, prior
         self._marks = marks
         self._bounds = (-math.inf, math.inf) if bounds is None else np.log(bounds)
         self._mark_places = [(mark.places - disc.centre) / disc.radius for mark in marks]
@@ -217,7 +243,7 @@ class _Likelihood:
 
     def rotation(self, geometry: Floats) -> Floats:
         """Rotation from crystal to specimen, shape (3, 3)."""
-        return scipy.spatial.transform.Rotation.from_rotvec(geometry[:3]).as_matrix() @ self._matrix
+        return rotation_of(geometry[:3]) @ self._matrix
 
     def _crystal_directions(self, places, geometry):
         """Directions in the crystal of places on the disc, shape (n, 3)."""
@@ -252,7 +278,7 @@ class _Likelihood:
             for mark, directions, target in zip(self._marks, self.mark_directions(geometry), self._targets, strict=True)
             if target is not None
         ]
-        return np.concatenate([*parts, [geometry[4] / STRETCH]])
+        return np.concatenate([*parts, [geometry[4] / self._prior]])
 
     def value(self, state: _State) -> float:
         """Deviance of the counts, and the squared deviations of the marks: what is minimised."""
@@ -264,8 +290,7 @@ class _Likelihood:
         mu, factor = self.expected(state)
         columns = [self._bins.slow * mu[:, None], (state.contrasts * (mu / factor)).T]
         if moving:
-            image = np.tensordot(state.amplitudes, self._densities, 1)[None]
-            columns += [self._slope(state, image, k, mu, factor)[:, None] for k in range(5)]
+            columns.append(self._slopes(state, mu / factor))
         columns = np.hstack(columns)
         weights = 1 / mu
         normal = columns.T @ (columns * weights[:, None])
@@ -279,12 +304,13 @@ class _Likelihood:
             right[-5:] -= slopes.T @ start
         return normal, right
 
-    def _slope(self, state, image, k, mu, factor):
-        """Numerical derivative of the expected counts by a number of the geometry, shape (n,)."""
-        shifted = state.geometry.copy()
-        shifted[k] += _DIFFERENCE
-        moved = sampled(image, self._crystal_directions(self._bins.places, shifted))[0] - state.amplitudes.sum()
-        return (moved - state.amplitudes @ state.contrasts) / _DIFFERENCE * mu / factor
+    def _slopes(self, state, slow):
+        """Numerical derivatives of the expected counts by the numbers of the geometry, shape (n, 5)."""
+        image = np.tensordot(state.amplitudes, self._densities, 1)[None]
+        shifted = state.geometry + _DIFFERENCE * np.eye(5)
+        places = np.concatenate([self._crystal_directions(self._bins.places, geometry) for geometry in shifted])
+        moved = sampled(image, places)[0].reshape(5, -1) - state.amplitudes.sum()
+        return ((moved - state.amplitudes @ state.contrasts) / _DIFFERENCE * slow).T
 
     def fixed_at_bounds(self, state: _State, normal: Floats, right: Floats, moving: bool) -> tuple[Floats, Floats]:
         """The same equations, without changes of amplitudes and of a scale that would leave their bounds."""
@@ -323,17 +349,20 @@ def refine(
     marks: Sequence[Mark] = (),
     steps: int = _STEPS,
     bounds: tuple[float, float] | None = None,
+    stretch: float = 0.0,
+    prior: float = STRETCH,
 ) -> Refined:
     """Maximise the likelihood near a start.
 
     It is a rotation from crystal to specimen, a scale [mm/rad], and amplitudes (k,), by default equal ones. `densities`
     are those of the master patterns, smoothed for the size of the bins, shape (k, m, m); `steps` is the largest number
-    of iterations, `bounds` are those of the scale at the centre [mm/rad].
+    of iterations, `bounds` are those of the scale at the centre [mm/rad], `prior` is the standard deviation of that of
+    the stretch.
     """
-    geometry = np.array([0.0, 0.0, 0.0, np.log(scale), 0.0])
+    geometry = np.array([0.0, 0.0, 0.0, np.log(scale), stretch])
     if bounds is not None:
-        geometry[3] = np.clip(geometry[3], *np.log(bounds))
-    likelihood = _Likelihood(bins, disc, densities, matrix, marks, bounds, geometry)
+        geometry[3] = np.clip(geometry[3], *(np.log(bounds) + math.log(1 - stretch)))
+    likelihood = _Likelihood(bins, disc, densities, matrix, marks, bounds, geometry, prior)
     if amplitudes is None:
         amplitudes = np.full(len(densities), 0.5 / len(densities))
     state = _State(bins.fit, amplitudes, geometry, likelihood.contrasts(geometry))
@@ -369,10 +398,10 @@ def _refined(bins, likelihood, state, normal, marks):
     used = np.count_nonzero(state.amplitudes)
     freedom = max(1, len(mu) - n_slow - used - 5)
     dispersion = max(pearson(bins.counts, mu) / freedom, 1.0)
-    covariance = np.full((4, 4), np.nan)
+    covariance = np.full((5, 5), np.nan)
     if normal is not None:
         free = np.concatenate([np.ones(n_slow, bool), state.amplitudes > 0, np.ones(5, bool)])
-        part = slice(n_slow + used, n_slow + used + 4)
+        part = slice(n_slow + used, n_slow + used + 5)
         covariance = np.linalg.pinv(normal[np.ix_(free, free)])[part, part]
     directions = likelihood.mark_directions(state.geometry)
     return Refined(

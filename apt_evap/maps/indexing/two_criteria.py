@@ -120,8 +120,8 @@ def _distinct(starts, group):
     distinct: list[Start] = []
     for start in starts:
         if not any(
-            misorientation(start.matrix, other.matrix, proper) < _SAME
-            and abs(math.log(start.scale / other.scale)) < _SAME_SCALE
+            abs(math.log(start.scale / other.scale)) < _SAME_SCALE
+            and misorientation(start.matrix, other.matrix, proper) < _SAME
             for other in distinct
         ):
             distinct.append(start)
