@@ -198,8 +198,11 @@ class PeakContents:
         kinds = np.where(strong[owner], kind, len(self._bases))
         peaks = self.columns(place[owner], np.vstack([self._bases, mixture @ self._bases])[kinds])
         every = hstack([peaks, self._smooth_background]).tocsc()
-        transposed, norm = every.T, np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
-        amplitudes = np.empty(every.shape[1])
+        norm = np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
+        held = np.flatnonzero(self.counts)  # other bins add zeros
+        counts, every = self.counts[held], every.tocsr()[held].tocsc()
+        transposed = every.T
+        amplitudes = np.empty(len(norm))
         share = np.append(mixture, 1.0)[kinds]
         amplitudes[: len(owner)] = np.maximum(height * BINS * 2.6, 1.0)[owner] * share
         if self._start is None:
@@ -211,7 +214,7 @@ class PeakContents:
         logs = np.log(self.scale.mass(place[strong]))
         alike = np.exp(-0.5 * ((logs[common][:, None] - logs) / _SAME_TAILS) ** 2)
         for _ in range(iterations):
-            amplitudes *= (transposed @ (self.counts / (every @ amplitudes + 1e-9))) / norm
+            amplitudes *= (transposed @ (counts / (every @ amplitudes + 1e-9))) / norm
             if common.any():
                 parts = amplitudes[rows]
                 near = alike @ parts
