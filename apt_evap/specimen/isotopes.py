@@ -13,6 +13,8 @@ from apt_evap.specimen.nuclides import ISOTOPES
 
 # relative: atomic weights rounded to three digits still count as natural, the isotopes of Ni, Cu, Fe and Si do not
 _SAME_MASS = 1e-3
+MOST_ELECTRONS = 118
+"""Electrons of the heaviest atom, oganesson: no atomic ion has more charges [e]."""
 
 
 def mean_mass(element: str) -> float:

@@ -7,6 +7,7 @@ from typing import Any
 from apt_evap._common.codec import checked, choice, count, from_plain, number, settings
 from apt_evap._common.notebook import as_table
 from apt_evap._common.validation import check_kind, check_name, did_you_mean, short_text
+from apt_evap.specimen.isotopes import MOST_ELECTRONS
 from apt_evap.specimen.lattice import BASES, nearest_neighbour_distance
 
 _KITTEL = "Kittel, Introduction to Solid State Physics, 8th ed. (2005), ch. 1, table 3"
@@ -49,7 +50,9 @@ class Material:
     evaporation_field: float = number(
         "Field at which an atom leaves without a barrier.", above=0, at_most=_HIGHEST_FIELD, unit="V/nm"
     )
-    charge_state: int = count("Dominant charge of the ion at the evaporation field.", at_least=1, at_most=118, unit="e")
+    charge_state: int = count(
+        "Dominant charge of the ion at the evaporation field.", at_least=1, at_most=MOST_ELECTRONS, unit="e"
+    )
     mass: float = number("Mass of the ion.", at_least=1, at_most=1e4, unit="Da")
     c: float | None = number(
         "Height of the hexagonal cell; needed for hcp, not allowed for the others.",

@@ -14,14 +14,13 @@ from apt_evap.detection.binning import MAX_BINS, count
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.emission.post_ionisation import RATIO_PARAMETERS, field_of_ratio
-from apt_evap.specimen.isotopes import ISOTOPES
+from apt_evap.specimen.isotopes import ISOTOPES, MOST_ELECTRONS
 
 LEAST = 20
 """Fewest ions of both charges for a ratio: 1.5 % of the field where both are equally frequent."""
 _PER_BIN = 50  # ions per bin by default: 1 % of the field where both charges are equally frequent
 _PER_SECTION = 100  # ions per section of a history by default
 _MOST_BINS = 256  # by default, as in `DetectorMap.from_hits`
-_HIGHEST = 118  # charge [e]
 _MASSES = (0.9, 1.2)  # mass of a simulated ion over that of an isotope, with all errors of its time of flight
 _STRANGERS = 0.01  # fraction of the ions that may have other masses
 
@@ -385,7 +384,7 @@ def _check_masses(masses, element):
 
 def _check_charge(charges, charge, element) -> int:
     """Return the lower charge of the pair, after a check that there are ions of both."""
-    numbers: Any = np.bincount(charges[(charges > 0) & (charges <= _HIGHEST)], minlength=3)
+    numbers: Any = np.bincount(charges[(charges > 0) & (charges <= MOST_ELECTRONS)], minlength=3)
     numbers[0] = 0
     if charge is None:
         rarer = np.minimum(numbers[:-1], numbers[1:])
@@ -394,7 +393,7 @@ def _check_charge(charges, charge, element) -> int:
             known = ", ".join(str(n) for n in np.flatnonzero(numbers)) or "none"
             raise ValueError(f"a ratio needs ions of {element} with two neighbouring charges, got charges {known}")
         return charge
-    charge = check_count(charge, "charge", at_least=1, at_most=_HIGHEST)
+    charge = check_count(charge, "charge", at_least=1, at_most=MOST_ELECTRONS)
     if not numbers[charge : charge + 2].sum():
         raise ValueError(f"there are no ions of {element} with the charges {charge} and {charge + 1}")
     return charge

@@ -1,6 +1,7 @@
 """Choice of the ions of a spectrum: evidence of all peaks against a cost of every ion and element."""
 
 from collections.abc import Collection, Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -14,10 +15,12 @@ _NEW_GAS, _NEW_COMMON, _NEW_RARE = 10.0, 25.0, 60.0  # of an element
 _ION = 8.0  # of an ion
 _MOLECULE = 1.5  # of a molecule, for each factor of e by which its atoms are rare
 _RAREST = 0.005  # share of the atoms that counts as that of rarer ones
-_UNUSUAL = (
-    15.0  # of unusual molecules, of three atoms of a metal, and of a charge of three or more without the one below
-)
-_PAIR = 40.0  # of two atoms of a metal with two charges, alone, with hydrogen, or as twice another ion: at its m/n
+_UNUSUAL = 15.0
+"""Of unusual molecules, of three atoms of a metal, of two or more with hydrogen, of a molecule of a metal with three
+charges, and of an atomic ion with three or more charges without the one below. Chosen by us."""
+_PAIR = 40.0
+"""Of two atoms of a metal with two charges, alone, with hydrogen, or as twice another ion: at its m/n. And of a hydride
+with three charges."""
 _NO_ATOMS = 60.0  # of an element without an atomic ion
 _HEAVY_GASES, _NO_GAS = ("C", "N", "O"), 20.0  # cost of one of these without an atomic ion; H is often in hydrides only
 UNNAMED = 40.0
@@ -31,6 +34,21 @@ _SHARED = 0.3  # of the ions of an ion, in the main peak of another that it may 
 def _metals_of(atoms):
     """Elements of an ion that are not those of gases."""
     return {name for name in atoms if name not in (*GASES, "D")}
+
+
+@lru_cache(8192)
+def unusual_cost(ion):
+    """Cost of an ion that spectra rarely show, by its formula and charge."""
+    atoms, metals = ion.atoms, _metals_of(ion.atoms)
+    most = max((atoms[name] for name in metals), default=0)
+    rest = {*atoms} - metals
+    cost = _UNUSUAL * (ion.formula in UNUSUAL or most > 2)
+    hydride = bool(metals and rest) and rest <= {"H", "D"}
+    if ion.charge > 2 and metals and sum(atoms.values()) > 1:
+        cost += _PAIR if hydride else _UNUSUAL
+    cost += _UNUSUAL * (most > 1 and hydride)
+    twice = rest <= {"H", "D"} or not any(number % 2 for number in atoms.values())
+    return cost + _PAIR * (ion.charge == 2 and most == 2 and twice)
 
 
 class IonChoice:
@@ -89,10 +107,7 @@ class IonChoice:
             charge[at] = ion.charge
             if sum(counts.values()) == 1:
                 atomic[at] = self._place[next(iter(counts))]
-            metals = max((number for name, number in counts.items() if name not in (*GASES, "D")), default=0)
-            unusual[at] = _UNUSUAL * (ion.formula in UNUSUAL or metals > 2)
-            twice = set(counts) - {"H", "D"} <= _metals_of(counts) or not any(n % 2 for n in counts.values())
-            unusual[at] += _PAIR * (ion.charge == 2 and metals == 2 and twice)
+            unusual[at] = unusual_cost(ion)
         self.atoms = np.vstack([self.atoms, atoms])
         self._charge = np.concatenate([self._charge, charge]).astype(int)
         self._atomic = np.concatenate([self._atomic, atomic]).astype(int)
@@ -134,7 +149,7 @@ class IonChoice:
         pairs = {(int(self._atomic[n]), int(self._charge[n])) for n in numbers if self._atomic[n] >= 0}
         return sum(charge >= 3 and (element, charge - 1) not in pairs for element, charge in pairs)
 
-    def _added_costs(self, numbers, chosen):
+    def added_costs(self, numbers, chosen):
         """By how much the cost of some ions rises with one more."""
         chosen = np.asarray(chosen, int)
         present, single = self._present(chosen)
@@ -194,11 +209,11 @@ class IonChoice:
 
     # ---- the search ------------------------------------------------------------------------------------------------
 
-    def value(self, chosen: Sequence[int]) -> float:
-        """Chi-squared and costs of some ions, with the shares of their atoms."""
+    def value(self, chosen: Sequence[int], part: float = 1.0) -> float:
+        """Chi-squared and costs, or a part of these, of some ions, with the shares of their atoms."""
         amplitudes, chi2 = self.fit.solve(chosen)
         self.learn_shares(chosen, amplitudes)
-        return chi2 + self.cost(chosen)
+        return chi2 + part * self.cost(chosen)
 
     def choose(self, most: int = 60, start: Sequence[int] = ()) -> tuple[list[int], Floats, float]:
         """The best ions, their amplitudes, and chi-squared with costs: by steps, removals and exchanges."""
@@ -213,7 +228,7 @@ class IonChoice:
                 self.learn_shares(chosen, amplitudes)
                 value = fit.solve(chosen)[1] + self.cost(chosen)
             tried = np.concatenate([self.candidates(chosen, amplitudes), unnamed[~np.isin(unnamed, chosen)]])
-            gains = fit.gains(tried, chosen, amplitudes) - self._added_costs(tried, chosen)
+            gains = fit.gains(tried, chosen, amplitudes) - self.added_costs(tried, chosen)
             best = None
             for at in np.argsort(-gains)[:_TRIED]:
                 if gains[at] < -1e-6:
@@ -335,7 +350,7 @@ class IonChoice:
         if not len(tried):
             return
         amplitudes, chi2 = fit.solve(rest)
-        totals = chi2 - fit.gains(tried, rest, amplitudes) + self.cost(rest) + self._added_costs(tried, rest)
+        totals = chi2 - fit.gains(tried, rest, amplitudes) + self.cost(rest) + self.added_costs(tried, rest)
         for at in np.argsort(totals)[:_TRIED]:
             if totals[at] > limit:
                 break

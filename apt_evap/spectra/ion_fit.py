@@ -18,8 +18,10 @@ _WINDOW = 3.0  # standard deviations of a place
 _UNSEEN = 1.0  # added to the distance of a place without a peak: a peak comes first
 _JOINED = 2.5  # standard deviations of two lines that are one peak
 _OWN_LINE, _OWN_LINES = 0.02, 2  # abundance and number of lines elsewhere, for which an ion may have a part of it
-_HIDDEN = 10.0  # errors of its content, from which a place without a peak, in the tail of another, may be a main line
-_MISSED = 0.25  # part of the isotopes of an ion that may have no place in a spectrum
+_HIDDEN = 6.0
+"""Errors of all lines of an ion without a peak together, from which one of them may be its main line: with 10, UH+ in
+the tail of U+ is lost."""
+MISSED = 0.25  # part of the isotopes of an ion that may have no place in a spectrum
 
 Rows = NDArray[np.int64]
 
@@ -75,8 +77,11 @@ class IonFit:
         )
         light = mass < LIGHT
         self.place_error = np.where(light, np.maximum(place, _LIGHT_ERROR), place)
-        self._window = np.maximum(np.minimum(_WINDOW * self.place_error, np.where(light, _LIGHT_WINDOW, window)), sigma)
-        self._hidden = ions > _HIDDEN * np.sqrt(contents.variance)
+        most = np.where(light, _LIGHT_WINDOW, window)
+        self._window = np.maximum(
+            np.minimum(_WINDOW * self.place_error, most), np.where(contents.seen, 1, _JOINED) * sigma
+        )
+        self._unseen = np.where(contents.seen, 0.0, 1 / contents.variance)
         self._target = ions / self.error
         self.all_chi2 = float(self._target @ self._target)
         """Chi-squared without ions."""
@@ -86,6 +91,7 @@ class IonFit:
         self._products: dict[int, Floats] = {}
         self._refresh()
         self._absent, self._own = np.zeros(self.number), np.zeros(self.number, bool)
+        self._hidden = self._unseen > 0
         self.missed, self.main, self.largest = np.zeros(self.number), np.arange(self.number), np.ones(self.number)
         self.shares = np.eye(self.number)
         """Share of the ions of each column in each peak, shape (columns, n)."""
@@ -155,11 +161,17 @@ class IonFit:
         self.shares = np.vstack([self.shares, contents])
         self.missed, self._own = np.concatenate([self.missed, missed]), np.concatenate([self._own, own])
         self._absent = np.concatenate([self._absent, absent])
+        self._hidden = np.concatenate([self._hidden, self._clear_unseen(contents)])
         main = np.argmax(contents, axis=1) if n else np.zeros(len(new), int)
         self.main = np.concatenate([self.main, main])
         self.largest = np.concatenate([self.largest, contents.max(axis=1, initial=0)])
         self._diagonal = np.concatenate([self._diagonal, np.einsum("ij,ij->i", rows, rows) + absent])
         self._projections = np.concatenate([self._projections, rows[:, :n] @ self._target])
+
+    def _clear_unseen(self, contents):
+        """Whether the lines of ions without a peak are clearly above zero together."""
+        held, square = contents @ (self._unseen * self.contents.ions), contents**2 @ self._unseen
+        return held > _HIDDEN * np.sqrt(np.maximum(square, 1e-300))
 
     def _noise(self, places):
         """Standard deviation of the content of places without a peak [Da]: of counting, and what may be there."""
@@ -172,8 +184,8 @@ class IonFit:
         """Whether ions have most of their isotopes in the spectrum, and a peak for the most abundant one or for two."""
         if not self.number:
             return np.zeros(len(numbers), bool)
-        seen = (self.contents.seen | self._hidden)[self.main[numbers]] | self._own[numbers]
-        return (self.missed[numbers] <= _MISSED) & (self.largest[numbers] > 0) & seen
+        seen = self.contents.seen[self.main[numbers]] | self._hidden[numbers] | self._own[numbers]
+        return (self.missed[numbers] <= MISSED) & (self.largest[numbers] > 0) & seen
 
     def _product(self, number):
         """Products of a column with all others."""

@@ -51,7 +51,6 @@ def ion_name(formula: str, charge: int) -> str:
     return "".join(parts) + (str(charge).translate(_SUPERSCRIPTS) if charge > 1 else "") + "⁺"
 
 
-@lru_cache(4096)
 def _parsed(formula):
     atoms: dict[str, int] = defaultdict(int)
     at = 0
@@ -83,12 +82,18 @@ def atoms_of_formula(formula: str) -> dict[str, int]:
         If the text is not a formula of elements of `ISOTOPES`, D, or natural isotopes of them.
     """
     check_kind(formula, "elements", str, 'formulas such as "W" or "CrO"')
+    return dict(_atoms(formula))
+
+
+@lru_cache(8192)
+def _atoms(formula):
+    """Atoms of a formula of known elements."""
     atoms = _parsed(formula) if len(formula) <= 30 else None
     if atoms is None:
         raise ValueError(f'elements must be formulas such as "W" or "CrO2", got {short_text(formula)}')
     for symbol in atoms:
         _natural(symbol)
-    return dict(atoms)
+    return atoms
 
 
 def element_of(symbol: str) -> str:

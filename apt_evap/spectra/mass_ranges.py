@@ -18,12 +18,12 @@ from apt_evap._common.validation import (
     short_text,
 )
 from apt_evap.detection.hits import Hits
+from apt_evap.specimen.isotopes import MOST_ELECTRONS
 from apt_evap.specimen.nuclides import ISOTOPES
 from apt_evap.warnings import DataWarning, warn
 
 _MANY = 1 / 3  # of the ions outside every range; measured: 7 % of an oxide on silicon with its own ranges
 
-_HIGHEST = 118  # charge [e]: no atom has more electrons
 _CLOSE = 0.02  # an ion whose isotopes are this far outside its range is another one; peaks have tails of 1 %
 
 
@@ -303,5 +303,5 @@ class Ranges:
 
 def _nearest_charge(masses, mass_to_charge):
     """Charge with which an isotope is nearest to a mass-to-charge ratio [Da]."""
-    charges = np.arange(1, _HIGHEST + 1)
+    charges = np.arange(1, MOST_ELECTRONS + 1)
     return 1 + int(abs(masses[:, None] / charges - mass_to_charge).min(axis=0).argmin())

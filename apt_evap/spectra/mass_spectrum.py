@@ -382,8 +382,8 @@ class _Named:
             explanation.amplitudes,
             explanation.covariance,
             [
-                ([fit.ions[n].atoms for n in numbers], x, worse)  # type: ignore[union-attr]
-                for numbers, x, worse in explanation.sets
+                ([fit.ions[n].atoms for n in numbers], x, covariance, worse)  # type: ignore[union-attr]
+                for numbers, x, covariance, worse in explanation.sets
             ],
         )
         model = fit.explained(explanation.chosen, explanation.amplitudes)

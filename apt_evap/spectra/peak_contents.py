@@ -24,7 +24,12 @@ broad as the others 80 % have errors below 0.92, 0.83 and 0.83 % for 100, 200 an
 _ALONE = 12.0  # standard deviations to the next peaks, for tails of its own
 _SMALL = 0.03  # height over its own of a peak that does not count
 _BACKGROUND_STEP = 0.15  # of ln m/n, between knots of the background
-_NEIGHBOURS = 0.10  # relative error of the tails of other peaks below a peak
+_NEIGHBOURS, _NEIGHBOURS_UNSEEN = 0.10, 0.3
+"""Relative error of the tails of other peaks below a peak, and below a place without one: with 0.1, half of the tails
+of 1,000 ions of Pt+ were ions of Pt2 2+."""
+_SAME_TAILS = 0.7
+"""Distance in ln m/n over which peaks have common tails. Mean L1 from the ions drawn of 50 broad specimens (seeds
+404102 and 404104, elements given): 0.166 with the same tails at all m/n, 0.126 with 1.2, 0.122 with 0.7."""
 _ROUNDS, _ITERATIONS = 3, 120
 _FLANK = 0.1
 """Relative error of the shape of a peak, and of its place in standard deviations, for shoulders: 48 of the new peaks of
@@ -121,7 +126,7 @@ class PeakContents:
                 mixture /= mixture.sum()
         self._mixture = mixture
         shapes = np.where(strong[:, None], shares, mixture) @ self._bases
-        return Contents(mass, seen, ions, self._variance(place, ions, shapes, below, mixture), below, shapes,
+        return Contents(mass, seen, ions, self._variance(place, seen, ions, shapes, below, mixture), below, shapes,
                         np.convolve(self.counts, np.ones(2 * CORE + 1), "same"))  # fmt: skip
 
     def _heights(self, places):
@@ -193,8 +198,11 @@ class PeakContents:
         kinds = np.where(strong[owner], kind, len(self._bases))
         peaks = self.columns(place[owner], np.vstack([self._bases, mixture @ self._bases])[kinds])
         every = hstack([peaks, self._smooth_background]).tocsc()
-        transposed, norm = every.T, np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
-        amplitudes = np.empty(every.shape[1])
+        norm = np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
+        held = np.flatnonzero(self.counts)  # other bins add zeros
+        counts, every = self.counts[held], every.tocsr()[held].tocsc()
+        transposed = every.T
+        amplitudes = np.empty(len(norm))
         share = np.append(mixture, 1.0)[kinds]
         amplitudes[: len(owner)] = np.maximum(height * BINS * 2.6, 1.0)[owner] * share
         if self._start is None:
@@ -203,17 +211,27 @@ class PeakContents:
         amplitudes[len(owner) :] = np.maximum(self._start, 1e-6 * self._start.max() + 1e-12)
         own = kinds < len(self._bases)
         rows = np.flatnonzero(own).reshape(-1, len(self._bases))
+        logs = np.log(self.scale.mass(place[strong]))
+        alike = np.exp(-0.5 * ((logs[common][:, None] - logs) / _SAME_TAILS) ** 2)
         for _ in range(iterations):
-            amplitudes *= (transposed @ (self.counts / (every @ amplitudes + 1e-9))) / norm
+            amplitudes *= (transposed @ (counts / (every @ amplitudes + 1e-9))) / norm
             if common.any():
                 parts = amplitudes[rows]
-                amplitudes[rows[common]] = parts[common].sum(1, keepdims=True) * (parts.sum(0) / parts.sum())
+                near = alike @ parts
+                amplitudes[rows[common]] = parts[common].sum(1, keepdims=True) * (
+                    near / np.maximum(near.sum(1, keepdims=True), 1e-300)
+                )
         self._start = amplitudes[len(owner) :].copy()
         of_kind = np.zeros((len(place), len(self._bases)))
         of_kind[owner[own], kinds[own]] = amplitudes[: len(owner)][own]
         ions = np.bincount(owner, amplitudes[: len(owner)], minlength=len(place))
         shares = of_kind / np.maximum(of_kind.sum(1, keepdims=True), 1e-9)
         return ions, shares, self._smooth_background @ amplitudes[len(owner) :]
+
+    @property
+    def shape(self) -> Floats:
+        """Mean shape of the strong peaks, shape (bins,)."""
+        return self._mixture / self._mixture.sum() @ self._bases
 
     def columns(self, place: Floats, shapes: Floats) -> Any:
         """Sparse matrix of shapes of peaks at places [bins], shape (size, n)."""
@@ -234,7 +252,7 @@ class PeakContents:
         low, high = np.interp(bounds + self._left + 0.5, np.arange(len(sums)), sums)
         return high - low
 
-    def _variance(self, place, ions, shapes, below, mixture):
+    def _variance(self, place, seen, ions, shapes, below, mixture):
         """Variance of contents: the counts of the core, tails of the neighbours, and four ions."""
         model = self.columns(place, shapes) @ ions + below
         core = float((mixture @ self._bases)[self._left - CORE : self._left + CORE + 1].sum())
@@ -245,7 +263,11 @@ class PeakContents:
         every, of_background = sums[high] - sums[low], sums_below[high] - sums_below[low]
         others = np.maximum(every - of_background - ions * core, 0)
         core = max(core, 0.3)
-        return np.maximum(every, 1) / core**2 + (_NEIGHBOURS * others / core) ** 2 + 4.0
+        return (
+            np.maximum(every, 1) / core**2
+            + (np.where(seen, _NEIGHBOURS, _NEIGHBOURS_UNSEEN) * others / core) ** 2
+            + 4.0
+        )
 
 
 def _isolated(place, height):

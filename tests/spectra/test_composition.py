@@ -11,7 +11,8 @@ import apt_evap as ae
 from apt_evap.cli.main import main
 from apt_evap.io.formats import read_ranges
 from apt_evap.spectra.composition import Amounts
-from apt_evap.spectra.ion_names import ion_name
+from apt_evap.spectra.ion_choice import unusual_cost
+from apt_evap.spectra.ion_names import Ion, ion_name
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 ALLOYS = {
@@ -82,6 +83,52 @@ def test_ions_in_the_broad_peaks_of_others_are_found():
         assert distance(result.composition, truth(ions)) < 1.0
 
 
+def test_hydrides_whose_lines_have_no_peaks_are_found():
+    """PtH2+ between the isotopes of Pt2+, UH+ in the tail of U+: L1 1.3 and 1.0; without them 11 and 7.0 at.%."""
+    platinum = {("Pt", 2): 10, ("Pt", 1): 4, ("PtH", 2): 3, ("Mo", 2): 10, ("Mo", 1): 4, ("H", 1): 2}
+    uranium = {("U", 1): 10, ("U", 2): 0.2, ("UH", 1): 3, ("Cu", 2): 40, ("Cu", 1): 4, ("H", 1): 2}
+    for ions in (platinum, uranium):
+        result = ae.spectrum(made(ions, 30_000, background=0.04, width=6e-4, tail=1.5e-3), list(truth(ions)))
+        assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+        assert distance(result.composition, truth(ions)) < 2
+
+
+def test_unusual_ions_cost_more():
+    """A hydride with three charges, or a pair with two at the m/n of its atom, costs more than a new common element."""
+    cost = {name: unusual_cost(Ion(*name)) for name in (("PtH", 2), ("PtH", 3), ("Pt2", 2), ("Pt2", 1), ("Al2H", 1))}
+    assert cost["PtH", 2] == cost["Pt2", 1] == 0 < cost["Al2H", 1] < 25 < cost["PtH", 3] == cost["Pt2", 2]
+    assert unusual_cost(Ion("PtO", 3)) > unusual_cost(Ion("PtO", 2)) == 0
+
+
+def test_an_ion_is_found_by_lines_of_which_none_is_a_peak():
+    """170 ions of Pt+, 60 in each of three isotopes, beside Au+: at.% within two errors, 0 without them."""
+    ions = {("Ag", 1): 40, ("Ag", 2): 16, ("Pt", 1): 1, ("Au", 1): 1, ("Au", 2): 0.4, ("H", 1): 2}
+    composition = ae.spectrum(
+        made(ions, 10_000, background=0.04, width=6e-4, tail=1.5e-3), list(truth(ions))
+    ).composition
+    assert abs(composition["Pt"] - truth(ions)["Pt"]) < 2 * composition.error["Pt"] < 0.5
+
+
+def test_an_ion_below_the_peak_of_another_is_in_the_error():
+    """59Co+ is below 118Sn2+, 2.5 errors of the content of its peak: Co 3.7 ± 0.7 at.%, and 5.6 in truth."""
+    ions = {("Sn", 2): 47, ("Sn", 1): 1, ("Co", 2): 3, ("Co", 1): 1.4, ("Ti", 2): 12, ("Ti", 1): 12, ("H", 1): 2}
+    hits = made(ions, 10_000, background=0.04, width=6e-4, tail=1.5e-3)
+    composition = ae.spectrum(hits, list(truth(ions))).composition
+    assert composition.error["Co"] > 0.4
+    for element in ("Co", "Sn"):
+        (low, high), error = composition.span[element], composition.error[element]
+        assert low - 2 * error < truth(ions)[element] < high + 2 * error
+
+
+def test_where_a_hydride_may_be_an_element_the_error_has_both():
+    """SbH2+ or W3+, without W2+, in broad peaks."""
+    ions = {("Nb", 1): 40, ("Nb", 2): 0.8, ("Ga", 1): 10, ("Ga", 2): 4, ("Sb", 2): 3, ("Sb", 1): 1.2, ("W", 3): 1}
+    ions |= {("W", 2): 0.1, ("V", 2): 3, ("V", 1): 0.3, ("H", 1): 2}
+    composition = ae.spectrum(made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3)).composition
+    for element, value in truth(ions).items():
+        assert abs(composition.at_percent.get(element, 0) - value) < 2 * composition.error[element] + 0.05
+
+
 def test_a_molecule_is_not_twice_itself_with_two_charges():
     ions = {("Au", 1): 1, ("AuO", 1): 6, ("Mn", 2): 10, ("Mn", 1): 1, ("MnO", 1): 6, ("O", 1): 5, ("O2", 1): 3}
     names = {ion.name for ion in ae.spectrum(made(ions, 150_000), list(truth(ions))).ions}
@@ -89,18 +136,21 @@ def test_a_molecule_is_not_twice_itself_with_two_charges():
 
 
 def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
-    """At 184 Da isotopes are three, or two, standard deviations apart: W+, L1 0.3; "W+ or WH+", H 5.7 to 16."""
+    """At 184 Da isotopes are three, or two, standard deviations apart: W+ or "WH+, or W+" as it is; W+, L1 1.2."""
     ions = {("W", 2): 40, ("W", 1): 16, ("Y", 1): 40, ("Y", 2): 16, ("Pt", 2): 4, ("Cr", 2): 4, ("Cr", 1): 1.6}
     ions |= {("Mg", 1): 4, ("H", 1): 8}
-    expected = truth(ions)
-    result = ae.spectrum(made(ions, 300_000, width=1.2e-3, tail=4e-3, error=(6e-4, -1e-3)), list(expected))
-    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
-    assert distance(result.composition, expected) < 0.6
+    for hydride in ({}, {("WH", 1): 8}):
+        expected = truth(ions | hydride)
+        hits = made(ions | hydride, 300_000, seed=2, width=1.2e-3, tail=4e-3, error=(6e-4, -1e-3))
+        result = ae.spectrum(hits, list(expected))
+        assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions | hydride}
+        assert distance(result.composition, expected) < 0.6
+        for ion in result.ions if hydride else ():
+            assert ion.others == (("W⁺",) if ion.name == "WH⁺" else ())
+    assert result.composition.error["H"] > 2  # 10.9, or 5.7 without it
     result = ae.spectrum(made(ions, 300_000, width=1.8e-3, tail=6e-3, error=(6e-4, -1e-3)), list(expected))
-    composition = result.composition
-    for element in ("W", "Y", "Cr", "Mg", "H"):
-        low, high = composition.span[element]
-        assert low - 2 * composition.error[element] < expected[element] < high + 2 * composition.error[element]
+    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+    assert distance(result.composition, truth(ions)) < 2
 
 
 @pytest.mark.parametrize("number", [1500, 12_000])
@@ -237,12 +287,31 @@ def test_errors_follow_from_counting():
 
 def test_other_names_are_in_the_error_by_their_likelihood():
     """The same ions under another name, as likely: half of the probability is at 100 at.%, half at 0."""
-    amounts = Amounts([{"A": 1}, {"B": 1}], np.array([50.0, 50.0]), np.zeros((2, 2)), [([{"C": 1}], np.ones(1), 0.0)])
+    amounts = Amounts(
+        [{"A": 1}, {"B": 1}],
+        np.array([50.0, 50.0]),
+        np.zeros((2, 2)),
+        [([{"C": 1}], np.ones(1), np.zeros((1, 1)), 0.0)],
+    )
     composition = amounts.composition(0.0)
-    assert composition.error == pytest.approx({"A": 50 / np.sqrt(2), "B": 50 / np.sqrt(2)})
+    half = 50 / np.sqrt(2)
+    assert composition.error == pytest.approx({"A": half, "B": half, "C": 2 * half})
     assert composition.span == {"A": (0, 50), "B": (0, 50), "C": (0, 100)} and "perhaps C: 0 to 100" in str(composition)
-    unlikely = Amounts(amounts.atoms, amounts.ions, amounts.covariance, [([{"C": 1}], np.ones(1), 10.0)])
-    assert unlikely.composition(0.0).error["A"] == pytest.approx(50 / np.sqrt(np.exp(5) + 1))
+    unlikely = Amounts(
+        amounts.atoms, amounts.ions, amounts.covariance, [([{"C": 1}], np.ones(1), np.zeros((1, 1)), 4.0)]
+    )
+    assert unlikely.composition(0.0).error["A"] == pytest.approx(50 / np.sqrt(np.exp(2) + 1))
+    absent = Amounts(amounts.atoms, amounts.ions, amounts.covariance, [([{"C": 1}], np.ones(1), np.zeros((1, 1)), 7.0)])
+    assert absent.composition(0.0).error["A"] == 0 and absent.composition(0.0).span == composition.span  # 3 %
+
+
+def test_the_error_of_an_element_that_only_other_names_have_is_of_counting():
+    """A third of 300 ions may be C, and improbably: sqrt(p (1 - p) / n) as if it were there."""
+    ions = np.array([200.0, 100.0])
+    other = [{"A": 1}, {"C": 1}], ions, np.diag(ions), 200.0
+    composition = Amounts([{"A": 1}, {"B": 1}], ions, np.diag(ions), [other]).composition(0.0)
+    assert composition.error["C"] == pytest.approx(100 * np.sqrt(1 / 3 * 2 / 3 / 300))
+    assert "C" not in composition.at_percent and composition.span["C"] == pytest.approx((0, 100 / 3))
 
 
 def test_one_line_of_three_charges_is_enough_where_no_other_ion_has_its_place():
