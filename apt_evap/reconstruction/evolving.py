@@ -47,7 +47,7 @@ WIDEST_VIEW = 60.0
 
 EMISSION_GATE = 0.33
 """Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 at rest or with the rolling of aluminium,
-0.37 to 0.47 if all ions roll, and then the surface is no better than the cap."""
+0.34 to 0.47 if all ions roll, and then the surface is no better than the cap."""
 VOLTAGE_GATE = 0.02
 """Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
 a layer of 1.15 times the field across the whole specimen."""
