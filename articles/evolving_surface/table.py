@@ -226,6 +226,7 @@ def lines_of(geometry, way, rows, of):
         line.append(" / ".join(filter(None, (over([one[side] for one in each]) for side in ("wide", "thick")))))
         line += [over([one[what] for one in each]) for what in ("density", "wrong")]
         fields = [row["fields"][k] for row in followed if len(row.get("fields", [])) > k]
+        fields = [one for one in fields if np.isfinite(one[1])]  # else no contrast was seen
         errors = f" ± {np.median([error for _, error in fields]):.3f}" if fields else ""
         line.append(over([ratio for ratio, _ in fields], 3) + errors)
         line.append(" / ".join(f"{part:.2f}" for part in np.mean(held, axis=0)) if held and k == 0 else "")
