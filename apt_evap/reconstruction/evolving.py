@@ -47,7 +47,7 @@ WIDEST_VIEW = 60.0
 
 EMISSION_GATE = 0.33
 """Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 at rest or with the rolling of aluminium,
-0.37 to 0.47 if all ions roll, and then the surface is no better than the cap."""
+0.34 to 0.47 if all ions roll, and then the surface is no better than the cap."""
 VOLTAGE_GATE = 0.02
 """Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
 a layer of 1.15 times the field across the whole specimen."""
@@ -58,7 +58,9 @@ VOLTAGE_ERROR = 0.017
 
 _WINDOW = 0.65  # of the radius: depth in which the trend is a straight line
 _FIRST_SHAPE = 0.065  # of the radius
-_PASSES = 7  # with voltage and phases after the first: fields change by less than 0.005 in the last
+_PASSES = 7  # most of them, with voltage and phases
+_SETTLED = 0.002  # change of the fields in the last pass
+_STEEPEST = 0.6  # slope of the fields that a pass gives over those it used
 _ION_LIMIT = 60_000  # in these passes; of more ions, every n-th
 _SPIN_UP = 0.05  # of the ions, from which nothing is measured: the first shape is not known
 _CLEAN = 0.02  # of the ions of a block: largest share of phases in a stretch of matrix
@@ -560,7 +562,7 @@ def _fixed_point(measured):
         way="ring", level=1.0, trend=np.array([1.0, 0.0]), features=[], contrasts=contrasts, fields=np.ones(n),
         positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
     )  # fmt: skip
-    compositions, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
+    _, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
     others = np.any([one.members for one in features], axis=0) if features else None
     contrast = _density_contrast(ions, others)
     if contrast > EMISSION_GATE:
@@ -586,31 +588,51 @@ def _fixed_point(measured):
     if ions.growth > 0:
         trend = _trend(measured.voltages * ring.fields, _matrix(features), depths)
     voltages = measured.voltages / (trend[0] + trend[1] * depths)
-    level = _level(voltages, ring.fields, features, n)
-    found = surface.integrate(voltages / level, _ion_fields(features), recession="mean")
-    errors = np.zeros(len(own))
-    compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
-    for _ in range(_PASSES):
-        features = [replace(one, ratio=float(ratios[k])) for one, k in zip(features, seen, strict=True)]
-        outside, ways = continued(features, found.positions, ions.in_ring)
-        before, thresholds = found.positions, _ion_fields(features)
-        # Without a phase at the rim the flux there is the better measure: depths 0.148 in place of 0.167 nm, and 16 in
-        # place of 17 % on the wrong side, of a sphere of 1.2 times the field.
-        by = "ring" if all(one.way == "none" for one in ways) else "surface"
-        found = surface.integrate(voltages / level, thresholds, outside, by)
-        values = found.fields * voltages / level
-        compositions, features = _features(measured, seen, contrasts, halves, found.positions, ratios)
-        level = _level(voltages, found.fields, features, n)
-        new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
-        ratios = ratios.copy()
-        ratios[seen] = np.clip(new, *_FIELD_LIMITS)
-    if rough := [way for way in ways if way.way == "ring"]:
+    start = nothing._replace(trend=trend, level=_level(voltages, ring.fields, features, n), features=features)
+    fixed = _found_by_passes(measured, start, surface, ring, voltages, seen, halves)
+    if rough := [way for way in fixed.ways if way.way == "ring"]:
         flatness = max(way.flatness for way in rough)
         return (
             f"a phase reaches the rim of the field of view, {max(way.share for way in rough):.2f} of the ring, "
             f"and is not flat: its thickness is {flatness:.2f} of its extent, above {FLAT_GATE:g}"
         )
-    return _Fixed(by, level, trend, features, contrasts, thresholds, before, ways, ratios, errors)
+    return fixed
+
+
+def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
+    """The fixed point of fields and positions, from a pass with the recession from the ring."""
+    ions, level, ratios, features, found = measured.ions, start.level, start.ratios, start.features, ring
+    errors = np.zeros(len(ratios))
+    used = given = None
+    for _ in range(_PASSES):
+        features = [replace(one, ratio=float(ratios[k])) for one, k in zip(features, seen, strict=True)]
+        outside, ways = continued(features, found.positions, ions.in_ring)
+        before, thresholds = found.positions, _ion_fields(features)
+        # Without a phase at the rim the flux there is the better measure: depths 0.148 in place of 0.167 nm, and 16 in
+        # place of 17 % on the wrong side, of a sphere of 1.2 times the field. It does not depend on the fields.
+        by = "ring" if all(one.way == "none" for one in ways) else "surface"
+        found = ring if by == "ring" else surface.integrate(voltages / level, thresholds, outside, by)
+        values = found.fields * voltages / level
+        compositions, features = _features(measured, seen, start.contrasts, halves, found.positions, ratios)
+        level = _level(voltages, found.fields, features, len(values))
+        new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
+        last, used, given = (used, given), ratios[seen], np.clip(new, *_FIELD_LIMITS)
+        if last[0] is not None and np.abs(given - used).max() < _SETTLED:
+            break
+        ratios = ratios.copy()
+        ratios[seen] = given if by == "ring" else np.clip(_extrapolated(used, given, *last), *_FIELD_LIMITS)
+    ratios = ratios.copy()
+    ratios[seen] = given
+    return _Fixed(by, level, start.trend, features, start.contrasts, thresholds, before, ways, ratios, errors)
+
+
+def _extrapolated(used, given, used_before, given_before):
+    """Fields that would be given as they are used, by the straight line through two passes, for each phase."""
+    if used_before is None:
+        return given
+    change = used - used_before
+    slopes = np.where(change == 0, 0.0, (given - given_before) / np.where(change == 0, 1.0, change))
+    return used + (given - used) / (1 - np.clip(slopes, 0.0, _STEEPEST))
 
 
 def _voltage_swing(measured):

@@ -208,8 +208,8 @@ class EvolvingSurface:
         outside : callable, optional
             Evaporation field at positions beyond the field of view, shape (..., 3), relative to that of the matrix.
         recession : str
-            "ring": from the flux in the ring. "mean": such that the mean of V F / F_evap stays 1, with the flux of a
-            sphere beyond the field of view. "surface": the same, and the surface beyond evaporates by its own field.
+            "ring": from the flux in the ring, with the flux of a sphere beyond the field of view. "surface": such that
+            the mean of V F / F_evap stays 1, and the surface beyond evaporates by its own field.
 
         Returns
         -------
@@ -228,8 +228,7 @@ class EvolvingSurface:
         kept = np.zeros((5, steps))
         shapes = np.empty((steps, degrees[-1] + 1, degrees[-1] + 1), np.complex128)
         height = np.zeros_like(shapes[0])
-        depth = control = 0.0
-        rate = np.zeros_like(self._area)
+        depth = 0.0
         for k in range(steps):
             chosen = slice(edges[k], edges[k + 1])
             radius = ions.radius + growth * max(depth, 0.0)
@@ -244,8 +243,7 @@ class EvolvingSurface:
             volume = ions.volume * (edges[k + 1] - edges[k])
             expected = volume / (ions.swept * radius**2)
             mean = float(np.mean(voltages[chosen] * at_surface[:, 0] / fields[chosen])) if volume else 1.0
-            if recession != "ring":
-                control = float(np.clip(_GAIN * (1 - mean), -_LARGEST_EXPONENT, _LARGEST_EXPONENT))
+            control = float(np.clip(_GAIN * (1 - mean), -_LARGEST_EXPONENT, _LARGEST_EXPONENT))
             sunk = expected * (ring[k] if recession == "ring" else math.exp(control))
             # 3. volume that leaves each node per solid angle: of the ions, and beyond the field of view
             gone = ions.volume * counts / self._area

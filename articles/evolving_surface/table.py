@@ -7,14 +7,14 @@ and with the local composition of solutes, and compares both with the true sites
 wrong side of an interface, evaporation fields, and how often the intervals of the positions hold the truth. Radius and
 compression are those that fit the run of pure aluminium; the efficiency is known. Other rows have a voltage with noise,
 a jump and a restart, constants from the map of the hits, or constants that are wrong by 5 %, drawn at random. ``python
-table.py -i runs -o out`` prints the table and writes ``cases.json``, ``table.rst`` (median and range over the cases),
-``seeds.rst`` (the same over the seeds of each geometry), and ``sections.png``.
+table.py -i runs -o out`` prints each case and writes ``cases.json``, ``table.md`` and ``table.rst`` (median and range
+over the seeds of each geometry), and ``sections.png``.
 """
 
 import argparse
 import json
+import re
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +29,23 @@ import baselines
 RADIUS, COMPRESSION = 12.963, 1.0342  # fitted to the sites of the pure run, R = 12 nm
 EFFICIENCY, HALF_ANGLE, DISTANCE = 0.5, 30.0, 100.0
 CONTRASTS = {"solute": 0.4, "20/2 %": 0.2, "6/2 %": 0.06}  # content of the phases, 2 % in the matrix
-CHOSEN_ON = ("pure_1", "sphere_high_1", "layer_high_1")
+GEOMETRIES = {
+    "pure": "pure", "sphere_low": "sphere, 0.8", "sphere_high": "sphere, 1.2", "layer_high": "layer, 1.15",
+    "two_spheres": "two small spheres, 0.8 and 1.2", "layer_low-shank10": "layer, 0.85, shank of 10°",
+    "layer40_high": "layer at 40°, 1.15", "layer40_low": "layer at 40°, 0.85", "sphere_edge": "sphere at the rim, 0.85",
+    "core_shell": "shell of 1.15 and core of 0.85", "alloy_sphere": "sphere of 40 % in 2 %",
+    "sphere_small-R20": "sphere, 0.8, R = 20 nm", "sphere_high-rolled (metal)": "sphere, 1.2, rolling of aluminium",
+    "sphere_high-rolled (all)": "sphere, 1.2, all ions roll",
+}  # fmt: skip
 PHASE_FIELDS = {
     "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
     "sphere_edge": [0.85], "layer_high": [1.15],
     "layer_low": [0.85], "layer40_high": [1.15], "layer40_low": [0.85], "two_spheres": [0.8, 1.2],
     "core_shell": [1.15, 0.85], "pure": [],
 }  # fmt: skip
+PARTS = {"core_shell": ("shell", "core")}
 EXACT = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
-DRAWS = 4  # of wrong constants
+DRAWS = 2  # of wrong constants, for each seed
 
 
 def detected(path, emission="rest", way="labels", seed=7):
@@ -139,19 +147,30 @@ def ways_of(base, emission, regions):
     """Methods beside the cap, and how each calls for its phases."""
     if not regions:
         return {"ring": ()}
+    if base == "alloy_sphere":
+        return {"labels": None, "solute": ("Cu",)}
     ways = {"labels": None}
     if emission == "rest":
         ways |= dict.fromkeys(CONTRASTS, ("Cu",))
         ways |= {"noisy voltage": None, "jump and restart": None, "constants of the map": None, "wrong constants": None}
-    if base == "alloy_sphere":
-        return {"labels": None, "solute": ("Cu",)}
     if base == "two_spheres":
         ways["two solutes"] = ("Cu", "Mg")
     return ways
 
 
+def judged(found, truth, exact=True):
+    """Row of a reconstruction: what was measured, and how often its intervals hold the truth."""
+    sites, phase, regions = truth
+    row = measured(found, sites, phase, regions)
+    if isinstance(found, ae.reconstruction.EvolvingReconstruction):
+        row["verdict"], row["fields"] = found.verdict, [(one.ratio, one.error) for one in found.phases]
+        if found.history is not None:
+            row["coverage"] = coverage(found, sites, EXACT if exact else None)
+    return row
+
+
 def compare(path, emission="rest", chosen=None, twin=None):
-    """One case by all methods, or by some, and with a twin: rows of the table."""
+    """One case by all methods, or by some, and with a twin: lists of rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
     base = name.split("-")[0]
     phases, shank, _, apex = runs.case(name)
@@ -161,86 +180,69 @@ def compare(path, emission="rest", chosen=None, twin=None):
     if shank > 1.5:
         growth = {"radius": "shank", "initial_radius": radius, "shank_angle": shank}
     hits, sites, phase = detected(path, emission)
-    rows = {"cap": measured(reconstructed(hits, **growth), sites, phase, regions)}
+    rows = {"cap": [judged(reconstructed(hits, **growth), (sites, phase, regions))]}
     rng = np.random.default_rng(sum(map(ord, path.stem)))
     for way, solutes in ways_of(base, emission, regions).items():
         if chosen and way not in chosen:
             continue
         hits, sites, phase = detected(path, emission, way)
-        how = {"labels": phase} if solutes is None else {"solutes": solutes}
-        start = time.process_time()
+        truth = sites, phase, regions
+        how = {"shape": "evolving"} | growth | ({"labels": phase} if solutes is None else {"solutes": solutes})
         if way == "wrong constants":
-            held = []
-            for _ in range(DRAWS):
-                found = reconstructed(hits, 1 + 0.05 * rng.normal(size=3), shape="evolving", **growth, **how)
-                if found.history is not None:
-                    held.append(coverage(found, sites, None))
-            rows[way] = {"coverage": np.mean(held, axis=0).tolist()} if held else {}
+            draws = 1 + 0.05 * rng.normal(size=(DRAWS, 3))
+            rows["cap, wrong constants"] = [judged(reconstructed(hits, each, **growth), truth) for each in draws]
+            rows[way] = [judged(reconstructed(hits, each, **how), truth, exact=False) for each in draws]
             continue
         factors = factors_of_map(hits) if way == "constants of the map" else (1.0, 1.0, 1.0)
-        found = reconstructed(hits, factors, shape="evolving", **growth, **how)
-        row = measured(found, sites, phase, regions)
-        row["seconds"] = time.process_time() - start
-        row["verdict"], row["fields"] = found.verdict, [(one.ratio, one.error) for one in found.phases]
-        if emission == "rest" and found.history is not None and way in ("labels", "ring"):
-            row["coverage"] = coverage(found, sites, EXACT)
-        rows[way] = row
+        rows[way] = [judged(reconstructed(hits, factors, **how), truth)]
         if twin is not None and way in ("labels", "ring"):
-            found = reconstructed(hits, shape="evolving", twin=twin, **growth, **how)
-            rows[f"{way}, twin"] = row = measured(found, sites, phase, regions) | {"verdict": found.verdict}
-            if found.history is not None:
-                row["coverage"] = coverage(found, sites, EXACT)
+            rows[f"{way}, twin"] = [judged(reconstructed(hits, twin=twin, **how), truth)]
     true = PHASE_FIELDS.get(base, [])
     return {"name": path.stem + ("" if emission == "rest" else f" ({emission})"), "true": true, "rows": rows}
 
 
-def lines_of(case):
-    """Lines of the table, one for each method."""
-    for way, row in case["rows"].items():
-        phases = "; ".join(
-            f"{one['wide']:.2f} / {one['thick']:.2f}, {one['density']:.2f}, {one['wrong']:.2f}"
-            for one in row.get("phases", [])
-        )
-        fields = "; ".join(f"{ratio:.3f} ± {error:.3f}" for ratio, error in row.get("fields", []))
-        held = " / ".join(f"{part:.2f}" for part in row.get("coverage", []))
-        errors = f"{row['lateral']:.3f} / {row['depth']:.3f}" if "lateral" in row else ""
-        yield [case["name"], way, errors, phases, fields, held], row.get("verdict", "")
+def over(values, digits=2):
+    """Median and range of values, as text."""
+    values = np.asarray(values, float)
+    if len(values) < 2:
+        return f"{values[0]:.{digits}f}" if len(values) else ""
+    return f"{np.median(values):.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
 
 
-def summary(cases):
-    """Lines of the table of medians and ranges over the cases, one for each method."""
-
-    def over(values, digits=2):
-        values = np.asarray(values, float).ravel()
-        if not len(values):
-            return ""
-        return f"{np.median(values):.{digits}f} ({values.min():.{digits}f} to {values.max():.{digits}f})"
-
-    for way in dict.fromkeys(way for case in cases for way in case["rows"]):
-        rows = [(case["rows"][way], case["rows"]["cap"]) for case in cases if way in case["rows"]]
-        followed = [(row, cap) for row, cap in rows if not row.get("verdict", "").startswith("cap")]
-        phases = [one for row, _ in followed for one in row.get("phases", [])]
-        held = np.array([row["coverage"] for row, _ in followed if "coverage" in row])
-        yield [
-            way, f"{len(followed)} of {len(rows)}",
-            over([row["lateral"] for row, _ in followed if "lateral" in row]),
-            over([row["depth"] for row, _ in followed if "depth" in row]),
-            over([row["lateral"] / cap["lateral"] for row, cap in followed if "lateral" in row]),
-            over([row["depth"] / cap["depth"] for row, cap in followed if "lateral" in row]),
-            over([one[side] for one in phases for side in ("wide", "thick")]),
-            over([one["density"] for one in phases]), over([one["wrong"] for one in phases]),
-            " / ".join(f"{part:.2f}" for part in held.mean(axis=0)) if len(held) else "",
-        ]  # fmt: skip
+def lines_of(geometry, way, rows, of):
+    """Lines of the table of one method, one for each phase."""
+    followed = [row for row in rows if not row.get("verdict", "").startswith("cap")]
+    of += f", {len(rows) - len(followed)} left to the cap" if len(followed) < len(rows) else ""
+    label, parts = GEOMETRIES[geometry], PARTS.get(geometry, ("first", "second"))
+    if not followed:
+        yield [f"{label}, {of}", way, *[""] * 7]
+        return
+    held = [row["coverage"] for row in followed if "coverage" in row]
+    n = len(followed[0]["phases"])
+    for k in range(max(n, 1)):
+        line = [label + (f": {parts[k]}" if n > 1 else "") + f", {of}", way]
+        line += [over([row[side] for row in followed], 3) if k == 0 else "" for side in ("lateral", "depth")]
+        each = [row["phases"][k] for row in followed if row["phases"]]
+        line.append(" / ".join(filter(None, (over([one[side] for one in each]) for side in ("wide", "thick")))))
+        line += [over([one[what] for one in each]) for what in ("density", "wrong")]
+        fields = [row["fields"][k] for row in followed if len(row.get("fields", [])) > k]
+        fields = [one for one in fields if np.isfinite(one[1])]  # else no contrast was seen
+        errors = f" ± {np.median([error for _, error in fields]):.3f}" if fields else ""
+        line.append(over([ratio for ratio, _ in fields], 3) + errors)
+        line.append(" / ".join(f"{part:.2f}" for part in np.mean(held, axis=0)) if held and k == 0 else "")
+        yield line
 
 
-def by_geometry(cases):
-    """Lines of the table of medians and ranges over the seeds of each geometry."""
-    geometries = dict.fromkeys(case["name"].rsplit("_", 1)[0] for case in cases)
-    for geometry in geometries:
-        seeds = [case for case in cases if case["name"].rsplit("_", 1)[0] == geometry]
-        for way, _, *values in summary(seeds):
-            if len(seeds) > 1 and way != "wrong constants":
-                yield [f"{geometry}, {len(seeds)} seeds", way, *values]
+def table_of(cases):
+    """Lines of the table: the seeds of each geometry by each method."""
+    for geometry in GEOMETRIES:
+        seeds = [case for name, case in cases.items() if re.sub(r"_\d+", "", name) == geometry]
+        for way in dict.fromkeys(way for case in seeds for way in case["rows"]):
+            parts = [case["rows"][way] for case in seeds if way in case["rows"]]
+            of = f"{len(parts)} seed{'s' * (len(parts) > 1)}"
+            if len(parts[0]) > 1:
+                of += f" of {len(parts[0])} draws"
+            yield from lines_of(geometry, way, [row for part in parts for row in part], of)
 
 
 def draw(paths, output):
@@ -296,21 +298,20 @@ def main():
             continue
         for emission in ("rest", "metal", "all") if "-rolled" in path.stem else ("rest",):
             case = compare(path, emission, options.ways, twin)
+            case["rows"] = cases.get(case["name"], case)["rows"] | case["rows"]
             cases[case["name"]] = case
-            for row, verdict in lines_of(case):
-                print(" | ".join(row), "|", verdict, flush=True)
+            for line in table_of({case["name"]: case}):
+                print(" | ".join(line), flush=True)
             kept.write_text(json.dumps(cases, indent=1, default=float))
-    rest = [case for name, case in cases.items() if "(" not in name]
-    judged = [case for case in rest if case["name"] not in CHOSEN_ON]
-    header = ["method", "followed", "lateral [nm]", "depth [nm]", "lateral over cap", "depth over cap",
-              "width and thickness", "density", "wrong side", "coverage"]  # fmt: skip
-    for name, rows in (
-        ("table.rst", [header, *summary(judged)]),
-        ("seeds.rst", [["geometry", "method", *header[2:]], *by_geometry(rest)]),
-    ):
-        table = [".. list-table::\n   :header-rows: 1\n"]
-        table += ["   * - " + "\n     - ".join(row) for row in rows]
-        (options.output / name).write_text("\n".join(table) + "\n")
+    header = ["case, field", "method", "lateral [nm]", "depth [nm]", "width / thickness", "density", "wrong side",
+              "field found", "coverage"]  # fmt: skip
+    lines = [header, *table_of(cases)]
+    table = [f"| {' | '.join(line)} |" for line in lines]
+    table.insert(1, "|---" * len(header) + "|")
+    (options.output / "table.md").write_text("\n".join(table) + "\n")
+    table = [".. csv-table::", "   :header-rows: 1", "   :delim: |", ""]
+    table += ["   " + " | ".join(line).rstrip() for line in lines]
+    (options.output / "table.rst").write_text("\n".join(table) + "\n")
     if not options.only:
         chosen = [path for path in paths if path.stem in ("layer_high_1", "sphere_low_1")]
         draw(chosen, options.output)

@@ -7,6 +7,8 @@ import pytest
 from fluxes import even_flux
 
 import apt_evap as ae
+from apt_evap.reconstruction import evolving as module
+from apt_evap.reconstruction.evolving_surface import EvolvingSurface
 
 KNOWN = {"atomic_volume": 0.0166, "efficiency": 0.5, "distance": 100.0, "projection": "compressed", "compression": 1.0}
 HALF = 0.54  # rad
@@ -221,6 +223,41 @@ def test_at_the_rim_the_errors_of_fields_and_voltage_are_those_of_the_recession(
     # before it only the averages over 0.15 nm of shapes that the layer beyond the field of view has changed
     first, later = (np.abs(moved[rows, 2]).mean() for rows in (slice(100), slice(1700, None)))
     assert later > 0.01 and first < 0.5 * later
+
+
+@pytest.mark.parametrize("reaches", [False, True])
+def test_passes_are_as_many_as_the_fields_need(monkeypatch, reaches):
+    hits, labels = ions_of(voltage=varying())
+    if not reaches:
+        places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
+        labels = (np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 1.5).astype(int)
+    ways, plain = [], EvolvingSurface.integrate
+
+    def counted(surface, voltages=None, fields=None, outside=None, recession="ring"):
+        ways.append(recession)
+        return plain(surface, voltages, fields, outside, recession)
+
+    def halfway(measured, features, compositions, values, positions):
+        return np.array([(features[0].ratio + 1.16) / 2]), np.array([0.01])
+
+    monkeypatch.setattr(EvolvingSurface, "integrate", counted)
+    monkeypatch.setattr(module, "_found_fields", halfway)
+    found = evolving(hits, labels=labels)
+    # 1, 1.08, then 1.16 by the straight line; one pass before and one over all ions
+    assert ways == (["ring", "surface", "surface", "surface", "surface"] if reaches else ["ring", "ring"])
+    # the recession from the rim does not depend on the fields, which are taken as they are given: 1.16 - 0.16 / 2^7
+    assert found.phases[0].ratio == pytest.approx(1.16 if reaches else 1.15875, abs=1e-12)
+    assert found.ion_fields[labels == 1] == pytest.approx(1.16 if reaches else 1.1575, abs=1e-12)
+
+
+def test_the_next_fields_are_where_a_straight_line_gives_what_it_is_given():
+    first, second = np.array([1.0, 1.0, 1.0, 1.0]), np.array([1.08, 1.08, 0.9, 1.0])
+    slopes = np.array([0.5, 0.9, -0.4, 0.5])
+    given = [1.16 + slopes * (used - 1.16) for used in (first, second)]
+    np.testing.assert_array_equal(module._extrapolated(first, given[0], None, None), given[0])
+    found = module._extrapolated(second, given[1], first, given[0])
+    # the second is steeper than 0.6, the third falls, the fourth had no change
+    np.testing.assert_allclose(found, [1.16, 1.08 + 0.008 / 0.4, given[1][2], given[1][3]], rtol=1e-12)
 
 
 @pytest.mark.slow
