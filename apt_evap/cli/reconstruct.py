@@ -302,6 +302,7 @@ def _crystal(options, settings, crystal):
 def _tell_check(options, reconstruction, material, axis, assumed):
     """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
     from apt_evap.reconstruction.phase_size import phase_sizes
+    from apt_evap.reconstruction.position_errors import CONSTANT_ERRORS, LOCAL_SCATTER
     from apt_evap.reconstruction.specimen_check import check_specimen
 
     if not any(phase.error == phase.error for phase in reconstruction.phases):
@@ -310,12 +311,19 @@ def _tell_check(options, reconstruction, material, axis, assumed):
     sizes = phase_sizes(reconstruction)
     for size in sizes:
         tell(options, str(size))
+    if sizes:
+        constants = ", ".join(f"{name} {error:.0%}" for name, error in CONSTANT_ERRORS.items())
+        tell(
+            options,
+            f"errors of sizes count on {constants}, and on places along the surface that scatter by "
+            f"{LOCAL_SCATTER[0]:.2f} nm, as of ions at rest (Al, R = 12 nm): those of ions that roll scatter more",
+        )
     check = check_specimen(reconstruction, material, axis=axis)
     along = " ".join(f"{part:g}" for part in axis)
     tell(options, f"{check}; simulated along [{along}]{', which is assumed: --check H,K,L' if assumed else ''}")
     found = {"explained": check.explained, "error": check.error, "confirmed": check.is_confirmed, "ions": check.ions}
     found["axis"] = list(axis)
-    return found | {"sizes": [size._asdict() for size in sizes]}
+    return found | {"sizes": [size._asdict() for size in sizes], "scatter": list(LOCAL_SCATTER)}
 
 
 def _ions(options, output):
