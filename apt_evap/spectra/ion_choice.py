@@ -37,7 +37,7 @@ def _metals_of(atoms):
 
 
 @lru_cache(8192)
-def unusual_cost(ion):
+def unusual_cost(ion: Ion) -> float:
     """Cost of an ion that spectra rarely show, by its formula and charge."""
     atoms, metals = ion.atoms, _metals_of(ion.atoms)
     most = max((atoms[name] for name in metals), default=0)
@@ -149,7 +149,7 @@ class IonChoice:
         pairs = {(int(self._atomic[n]), int(self._charge[n])) for n in numbers if self._atomic[n] >= 0}
         return sum(charge >= 3 and (element, charge - 1) not in pairs for element, charge in pairs)
 
-    def added_costs(self, numbers, chosen):
+    def added_costs(self, numbers: Rows, chosen: Sequence[int]) -> Floats:
         """By how much the cost of some ions rises with one more."""
         chosen = np.asarray(chosen, int)
         present, single = self._present(chosen)
