@@ -311,6 +311,7 @@ def _tell_check(options, reconstruction, material, axis, assumed):
     sizes = phase_sizes(reconstruction)
     for size in sizes:
         tell(options, str(size))
+    counted = {**CONSTANT_ERRORS, "scatter_along": LOCAL_SCATTER[0], "scatter_across": LOCAL_SCATTER[1]}
     if sizes:
         constants = ", ".join(f"{name} {error:.0%}" for name, error in CONSTANT_ERRORS.items())
         tell(
@@ -323,7 +324,7 @@ def _tell_check(options, reconstruction, material, axis, assumed):
     tell(options, f"{check}; simulated along [{along}]{', which is assumed: --check H,K,L' if assumed else ''}")
     found = {"explained": check.explained, "error": check.error, "confirmed": check.is_confirmed, "ions": check.ions}
     found["axis"] = list(axis)
-    return found | {"sizes": [size._asdict() for size in sizes], "scatter": list(LOCAL_SCATTER)}
+    return found | {"sizes": [size._asdict() for size in sizes], "errors_of_sizes": counted}
 
 
 def _ions(options, output):

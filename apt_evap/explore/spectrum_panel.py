@@ -418,11 +418,13 @@ def _composition_table(composition: Composition) -> str:
     if composition.refused:
         return f"<b>no composition</b><br>{escape(composition.refused)}"
     rows = []
-    for element, value in composition.at_percent.items():
+    for element in [*composition.at_percent, *composition.perhaps]:
+        value = composition.at_percent.get(element)
+        name, number = (f"perhaps {element}", "0") if value is None else (element, f"{value:.2f}")
         low, high = composition.span[element]
         span = f"<small>{low:.2f} to {high:.2f}</small>" if high - low > max(composition.error[element], 0.005) else ""
         rows.append(
-            f"<tr><td><b>{escape(element)}</b></td><td style='text-align: right'>{value:.2f}</td>"
+            f"<tr><td><b>{escape(name)}</b></td><td style='text-align: right'>{number}</td>"
             f"<td>± {composition.error[element]:.2f}</td><td>{span}</td></tr>"
         )
     head = "<tr><td colspan=4><b>composition [at.%]</b></td></tr>"

@@ -17,6 +17,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
+from apt_evap._common.validation import check_choice
 from apt_evap._core.surface_map import place_ions
 from apt_evap.reconstruction.spherical_harmonics import Coefficients, SphericalTransform
 
@@ -215,6 +216,7 @@ class EvolvingSurface:
         -------
         SurfacePass
         """
+        recession = check_choice(recession, "recession", ("ring", "surface"))
         ions, transform = self.ions, self.transform
         n, growth, degrees = len(ions.directions), ions.growth, transform.degrees
         voltages = np.ones(n) if voltages is None else voltages

@@ -12,7 +12,8 @@ _LEAST_OF_OTHERS = 0.05  # at.%: less of an element that only other names have i
 _LIKELIEST = 0.05
 """Likelihood over that of the first explanation, below which another one is in the span and not in the error: it is
 outside an interval of 95 %. With all, Co 7.8 of a million ions of a nickel alloy has 0.8 at.% in place of 0.04."""
-_LIKELY = 2.0  # chi-squared and costs by which the likelihood of another explanation falls by a factor of e
+_LIKELY = 2.0  # chi-squared, with a part of the costs, by which the likelihood of others falls by a factor of e
+_NO_CHANGE = 0.2  # of the counting error: less changes that error by 2 % at most
 MOST_UNEXPLAINED = 0.1
 """Part of the ions in peaks without an explanation, above which there is no composition."""
 
@@ -55,16 +56,23 @@ class Composition:
             error = self.error[element]
             other = f" ({low:.2f} to {high:.2f} with other names)" if high - low > max(error, 0.005) else ""
             lines.append(f"{element}: {value:.2f} ± {error:.2f} at.%{other}")
-        for element, (_, high) in self.span.items():
-            if element not in self.at_percent and high > _LEAST_OF_OTHERS:
-                lines.append(f"perhaps {element}: 0 to {high:.2f} at.% with other names")
+        for element, high in self.perhaps.items():
+            lines.append(f"perhaps {element}: 0 to {high:.2f} at.% with other names, ± {self.error[element]:.2f}")
         return "\n".join(lines)
+
+    @property
+    def perhaps(self) -> dict[str, float]:
+        """Highest value of each element that only other names have [at.%]."""
+        others = {element: high for element, (_, high) in self.span.items() if element not in self.at_percent}
+        return {element: high for element, high in others.items() if high > _LEAST_OF_OTHERS}
 
     def plain(self) -> dict[str, object]:
         """As in the JSON of ``apt-evap composition``."""
         shares = {e: {"at_percent": value, "error": self.error[e]} for e, value in self.at_percent.items()}
-        reason = {"refused": self.refused} if self.refused else {}
-        return {"composition": shares, "unexplained": self.unexplained, **reason}
+        more: dict[str, object] = {"refused": self.refused} if self.refused else {}
+        if self.perhaps:
+            more["perhaps"] = {e: {"highest": high, "error": self.error[e]} for e, high in self.perhaps.items()}
+        return {"composition": shares, "unexplained": self.unexplained, **more}
 
 
 @dataclass(frozen=True)
@@ -99,20 +107,24 @@ class Amounts:
         if refused:
             return Composition({}, {}, {}, unexplained, refused)
         span = {element: [value, value] for element, value in share.items()}
-        weights, spread = 1.0, dict.fromkeys(share, 0.0)
+        weights, spread = dict.fromkeys(share, 1.0), dict.fromkeys(share, 0.0)
         for *other, worse in self.others:
             values, other_errors = _shares(*other)
             weight = math.exp(-max(worse, 0.0) / _LIKELY)
             weight *= weight > _LIKELIEST
-            weights += weight
             for element in {**span, **values} if values else ():
                 value = values.get(element, 0.0)
                 low, high = span.get(element, (0.0, 0.0))
                 span[element] = [min(low, value), max(high, value)]
                 if element not in share and value > high:
                     errors[element] = other_errors[element]
-                spread[element] = spread.get(element, 0.0) + weight * (value - share.get(element, 0.0)) ** 2
-        errors = {element: math.hypot(errors[element], math.sqrt(spread[element] / weights)) for element in span}
+                change = abs(value - share.get(element, 0.0))
+                # of an element that they do not change, others say nothing: they would make its error smaller
+                if change > _NO_CHANGE * errors[element]:
+                    weights[element] = weights.get(element, 1.0) + weight
+                    spread[element] = spread.get(element, 0.0) + weight * change**2
+        spreads = {element: math.sqrt(spread.get(element, 0.0) / weights.get(element, 1.0)) for element in span}
+        errors = {element: math.hypot(errors[element], spreads[element]) for element in span}
         order = sorted(share, key=lambda element: -share[element])
         every = [*order, *sorted({*span} - {*order})]
         return Composition(

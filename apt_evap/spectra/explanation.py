@@ -27,10 +27,10 @@ _ALIKE = 30.0
 """Chi-squared and costs by which another name of a peak may be worse: then both are named."""
 _ONE_PEAK = 4.0  # standard deviations of 1 Da, below which a hydride may be the isotopes of its metal
 _PRIOR = 0.25
-"""Part of the costs of other names that counts against them in the error. Of 117 and 118 shares of few and of broad
-ions (seed 404102, all elements tried) 91 and 92 % are within 1.96 errors with 0, 0.25, 0.5 and 1. With 0.5, SbH2+ is no
-longer W3+ (see the tests); with 0, hydrogen would be as likely deuterium."""
-_HIDDEN = 1.0  # chi-squared by which an ion in the peaks of others must be better, to be in the error
+"""Part of the costs of other names that counts against them in the error. Two cases chose it: with 0.5, SbH2+ is no
+longer W3+ (see the tests); with 0, hydrogen would be as likely deuterium. Coverage does not: of 117 and 118 shares of
+few and of broad ions (seed 404102, all elements tried) 91 and 92 % are within 1.96 errors with 0, 0.25, 0.5 and 1."""
+_LEAST_GAIN = 1.0  # of chi-squared, of an ion in the peaks of others: a standard error
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60
 _MANY = 0.01  # of all ions: an element with such an ion is there
@@ -513,7 +513,7 @@ class Explainer:
         tried = [ion for ion in tried if ion not in choice.banned_ions and ion not in ions]
         numbers = choice.numbers(tried)
         gains = fit.gains(numbers, chosen, amplitudes)
-        there = (gains > _HIDDEN) & (fit.missed[numbers] <= MISSED) & (fit.largest[numbers] > 0)
+        there = (gains > _LEAST_GAIN) & (fit.missed[numbers] <= MISSED) & (fit.largest[numbers] > 0)
         worse = _PRIOR * choice.added_costs(numbers, chosen) - gains
         return {tried[at]: float(worse[at]) for at in np.flatnonzero(there)}
 

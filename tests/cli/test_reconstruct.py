@@ -239,7 +239,7 @@ def test_the_precipitate_of_the_example_is_found_measured_and_confirmed(tmp_path
     (size,) = check["sizes"]
     assert abs(size["lateral"] - axes[:2].mean()) < 2 * size["lateral_error"] < 0.3
     assert abs(size["depth"] - axes[2]) < 2 * size["depth_error"] < 0.3
-    assert check["scatter"] == [0.174, 0.057]
+    assert check["errors_of_sizes"]["scatter_along"] == 0.174 and check["errors_of_sizes"]["radius"] == 0.05
 
 
 def test_the_errors_of_sizes_are_said_with_what_they_count_on(monkeypatch, capsys):

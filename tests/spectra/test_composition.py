@@ -305,6 +305,19 @@ def test_other_names_are_in_the_error_by_their_likelihood():
     assert absent.composition(0.0).error["A"] == 0 and absent.composition(0.0).span == composition.span  # 3 %
 
 
+def test_other_names_of_other_peaks_do_not_make_an_error_smaller():
+    """A may be C; ten other explanations change only B and D, by one ion of the thousand."""
+    ions = np.array([500.0, 300.0, 200.0])
+    named = [{"A": 1}, {"B": 1}, {"D": 1}]
+    doubt = [{"C": 1}, {"B": 1}, {"D": 1}], ions, np.diag(ions), 0.0
+    other = named, np.array([500.0, 301.0, 199.0]), np.diag(ions), 0.0
+    one, many = (
+        Amounts(named, ions, np.diag(ions), [doubt, *others]).composition(0.0) for others in ([], [other] * 10)
+    )
+    assert many.error == pytest.approx(one.error, rel=1e-6) and one.error["A"] > 30
+    assert many.plain()["perhaps"] == {"C": {"highest": 50.0, "error": many.error["C"]}}
+
+
 def test_the_error_of_an_element_that_only_other_names_have_is_of_counting():
     """A third of 300 ions may be C, and improbably: sqrt(p (1 - p) / n) as if it were there."""
     ions = np.array([200.0, 100.0])

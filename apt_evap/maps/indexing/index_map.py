@@ -125,10 +125,12 @@ class Candidate:
         The mixture of the patterns of all radii that fits best.
     rim_change : float
         Relative change of the distance per angle from the centre to the rim of the field of view, by a lens or by the
-        flight: negative for a barrel. The scale of the projection is that at the centre.
+        flight: negative for a barrel. The scale of the projection is that at the centre. Both are fitted anew, with the
+        orientation, after the verdict, whose score and confidence are of a smaller change.
     scale_error : float or None
         Standard error of this scale [mm/rad]: three times that by noise, as lines and poles of a specimen are not
-        those of the patterns. None if the scale was not fitted.
+        those of the patterns. At a bound that was given it is the error without the bound. None if the scale was not
+        fitted.
     """
 
     orientation: Orientation
@@ -434,6 +436,8 @@ def index(
         if patterns is None
         else check_sequence(patterns, "patterns", "MasterPattern")
     )
+    if not len(patterns):
+        raise ValueError("patterns must be one MasterPattern or more, got none")
     for pattern in patterns:
         check_kind(pattern, "patterns", MasterPattern, "MasterPattern")
         if pattern.structure != material.structure:

@@ -17,6 +17,10 @@ def composition_section(page: Page, spectrum: Spectrum) -> str:
             (element, f"{value:.2f} ± {composition.error[element]:.2f}", _span(composition, element))
             for element, value in composition.at_percent.items()
         ]
+        rows += [
+            (f"perhaps {element}", f"0 ± {composition.error[element]:.2f}", _span(composition, element))
+            for element in composition.perhaps
+        ]
         parts.append(table(rows, ("", "at.%", "with other names of the peaks")))
     figure = draw_spectrum(spectrum).figure
     parts.append(page.picture(figure, alt="mass spectrum with named peaks, unexplained ones marked"))
