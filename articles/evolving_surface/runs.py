@@ -46,6 +46,13 @@ def layer(ratio, tilt, width=2.4, apex=R):
     return phase("layer", ae.specimen.Layer(middle - width / 2, middle + width / 2, tuple(normal)), ratio)
 
 
+def grain(apex=R):
+    """A second grain, [111] along the axis; the boundary, 20 degrees from it, crosses it 4 nm below the apex."""
+    lean = np.radians(20)
+    normal = (0.8 * np.cos(lean), 0.6 * np.cos(lean), np.sin(lean))
+    return phase("grain", ae.specimen.HalfSpace((0.0, 0.0, apex - 4.0), normal), 1.0, axis=(1, 1, 1))
+
+
 def phase(name, region, ratio, **more):
     """A phase of aluminium with an evaporation field relative to that of the matrix."""
     return ae.specimen.Phase(name, ALUMINIUM, region, evaporation_field=ratio * ALUMINIUM.evaporation_field, **more)
@@ -83,6 +90,7 @@ def case(name):
             sphere("low", 0.8, 14, 0, 1.8, 0.6, apex),
             sphere("high", 1.2, 16, 200, 1.8, 1.8, apex),
         ],
+        "grains": lambda: [grain(apex)],
         "core_shell": lambda: [
             phase("shell", ball(0, 0, 3.0, 0.8, apex), 1.15),
             phase("core", ball(0, 0, 1.7, 2.1, apex), 0.85),
@@ -95,7 +103,7 @@ def case(name):
 
 CASES = (
     "pure:1-5 sphere_low:1-5 sphere_high:1-5 layer_high:1-5 two_spheres:1-5 layer_low-shank10:1-5 layer40_high:1 "
-    "layer40_low:1 sphere_edge:1 core_shell:1 alloy_sphere:1 sphere_small-R20:1 sphere_high-rolled:1"
+    "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_high-rolled:1"
 ).split()  # fmt: skip
 
 

@@ -8,7 +8,7 @@ wrong side of an interface, evaporation fields, and how often the intervals of t
 compression are those that fit the run of pure aluminium; the efficiency is known. Other rows have a voltage with noise,
 a jump and a restart, constants from the map of the hits, or constants that are wrong by 5 %, drawn at random. ``python
 table.py -i runs -o out`` prints each case and writes ``cases.json``, ``table.md`` and ``table.rst`` (median and range
-over the seeds of each geometry), and ``sections.png``.
+over the seeds of each geometry), and ``sections.png``; with ``--half-angle 20`` and ``--only`` rows of a narrower view.
 """
 
 import argparse
@@ -35,26 +35,30 @@ GEOMETRIES = {
     "layer40_high": "layer at 40°, 1.15", "layer40_low": "layer at 40°, 0.85", "sphere_edge": "sphere at the rim, 0.85",
     "core_shell": "shell of 1.15 and core of 0.85", "alloy_sphere": "sphere of 40 % in 2 %",
     "sphere_small-R20": "sphere, 0.8, R = 20 nm", "sphere_high-rolled (metal)": "sphere, 1.2, rolling of aluminium",
-    "sphere_high-rolled (all)": "sphere, 1.2, all ions roll",
+    "sphere_high-rolled (all)": "sphere, 1.2, all ions roll", "grains": "two grains",
 }  # fmt: skip
+GEOMETRIES |= {
+    f"{name} (20°)": f"{GEOMETRIES[name]}, half angle of 20°"
+    for name in ("pure", "sphere_low", "sphere_high", "layer_high")
+}
 PHASE_FIELDS = {
     "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
     "sphere_edge": [0.85], "layer_high": [1.15],
     "layer_low": [0.85], "layer40_high": [1.15], "layer40_low": [0.85], "two_spheres": [0.8, 1.2],
-    "core_shell": [1.15, 0.85], "pure": [],
+    "core_shell": [1.15, 0.85], "pure": [], "grains": [1.0],
 }  # fmt: skip
 PARTS = {"core_shell": ("shell", "core")}
 EXACT = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
 DRAWS = 2  # of wrong constants, for each seed
 
 
-def detected(path, emission="rest", way="labels", seed=7):
+def detected(path, emission="rest", way="labels", half_angle=HALF_ANGLE, seed=7):
     """Ions that the detector recorded: hits with a voltage and solutes that are drawn, sites and phases."""
     kept = np.load(path)
     places = kept[emission].astype(float)
     rho = np.hypot(*places.T)
     rng = np.random.default_rng(seed)
-    rows = np.isfinite(rho) & (rho < DISTANCE * np.tan(np.radians(HALF_ANGLE)))
+    rows = np.isfinite(rho) & (rho < DISTANCE * np.tan(np.radians(half_angle)))
     rows &= rng.random(len(rows)) < EFFICIENCY
     # the voltage of a rate that is controlled: that of the sites, averaged over 0.15 nm of 8.4 nm
     voltage = scipy.ndimage.gaussian_filter1d(kept["voltage"], 0.15 / 8.4 * len(rows), mode="nearest")
@@ -78,21 +82,21 @@ def detected(path, emission="rest", way="labels", seed=7):
     return hits, kept["sites"][rows], phase[rows]
 
 
-def reconstructed(hits, factors=(1.0, 1.0, 1.0), **how):
+def reconstructed(hits, factors=(1.0, 1.0, 1.0), half_angle=HALF_ANGLE, **how):
     """Reconstruction with the constants of all cases, times factors of compression, radius and efficiency."""
     how = {name: how[name] * factors[1] if name in ("radius", "initial_radius") and how[name] != "shank" else how[name]
            for name in how}  # fmt: skip
     return ae.reconstruct(
-        hits, atomic_volume=runs.VOLUME, distance=DISTANCE, detector_radius=DISTANCE * np.tan(np.radians(HALF_ANGLE)),
+        hits, atomic_volume=runs.VOLUME, distance=DISTANCE, detector_radius=DISTANCE * np.tan(np.radians(half_angle)),
         efficiency=EFFICIENCY * factors[2], projection="compressed", compression=COMPRESSION * factors[0], **how,
     )  # fmt: skip
 
 
-def factors_of_map(hits):
+def factors_of_map(hits, half_angle):
     """Compression by the poles of the map, and radius by the planes of a pole, from 0.9 of the right one: over ours."""
     given = {
         "distance": DISTANCE, "efficiency": EFFICIENCY, "atomic_volume": runs.VOLUME, "crystal": "fcc",
-        "field_of_view": 2 * DISTANCE * np.tan(np.radians(HALF_ANGLE)), "material": "Al", "a": runs.ALUMINIUM.a,
+        "field_of_view": 2 * DISTANCE * np.tan(np.radians(half_angle)), "material": "Al", "a": runs.ALUMINIUM.a,
     }  # fmt: skip
     found, compression = baselines.orientation(hits, given)
     radius = 0.9 * RADIUS
@@ -147,6 +151,8 @@ def ways_of(base, emission, regions):
     """Methods beside the cap, and how each calls for its phases."""
     if not regions:
         return {"ring": ()}
+    if base == "grains":
+        return {"ring": (), "labels": None}
     if base == "alloy_sphere":
         return {"labels": None, "solute": ("Cu",)}
     ways = {"labels": None}
@@ -169,23 +175,23 @@ def judged(found, truth, exact=True):
     return row
 
 
-def compare(path, emission="rest", chosen=None, twin=None):
+def compare(path, emission="rest", chosen=None, twin=None, half_angle=HALF_ANGLE):
     """One case by all methods, or by some, and with a twin: lists of rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
     base = name.split("-")[0]
     phases, shank, _, apex = runs.case(name)
     regions = [one.region for one in phases[1:]]
     radius = RADIUS * apex / runs.R
-    growth = {"radius": radius}
+    growth = {"radius": radius, "half_angle": half_angle}
     if shank > 1.5:
-        growth = {"radius": "shank", "initial_radius": radius, "shank_angle": shank}
-    hits, sites, phase = detected(path, emission)
+        growth |= {"radius": "shank", "initial_radius": radius, "shank_angle": shank}
+    hits, sites, phase = detected(path, emission, half_angle=half_angle)
     rows = {"cap": [judged(reconstructed(hits, **growth), (sites, phase, regions))]}
     rng = np.random.default_rng(sum(map(ord, path.stem)))
     for way, solutes in ways_of(base, emission, regions).items():
         if chosen and way not in chosen:
             continue
-        hits, sites, phase = detected(path, emission, way)
+        hits, sites, phase = detected(path, emission, way, half_angle)
         truth = sites, phase, regions
         how = {"shape": "evolving"} | growth | ({"labels": phase} if solutes is None else {"solutes": solutes})
         if way == "wrong constants":
@@ -193,12 +199,13 @@ def compare(path, emission="rest", chosen=None, twin=None):
             rows["cap, wrong constants"] = [judged(reconstructed(hits, each, **growth), truth) for each in draws]
             rows[way] = [judged(reconstructed(hits, each, **how), truth, exact=False) for each in draws]
             continue
-        factors = factors_of_map(hits) if way == "constants of the map" else (1.0, 1.0, 1.0)
+        factors = factors_of_map(hits, half_angle) if way == "constants of the map" else (1.0, 1.0, 1.0)
         rows[way] = [judged(reconstructed(hits, factors, **how), truth)]
         if twin is not None and way in ("labels", "ring"):
             rows[f"{way}, twin"] = [judged(reconstructed(hits, twin=twin, **how), truth)]
     true = PHASE_FIELDS.get(base, [])
-    return {"name": path.stem + ("" if emission == "rest" else f" ({emission})"), "true": true, "rows": rows}
+    view = "" if half_angle == HALF_ANGLE else f" ({half_angle:g}°)"
+    return {"name": path.stem + ("" if emission == "rest" else f" ({emission})") + view, "true": true, "rows": rows}
 
 
 def over(values, digits=2):
@@ -288,6 +295,7 @@ def main():
     parser.add_argument(
         "--twin", type=Path, metavar="RUN.h5", help="run of the matrix alone, for more rows; default: none"
     )
+    parser.add_argument("--half-angle", type=float, default=HALF_ANGLE, help="degrees; default: 30")
     options = parser.parse_args()
     twin = None if options.twin is None else ae.load(options.twin)
     kept = options.output / "cases.json"
@@ -297,7 +305,7 @@ def main():
         if options.only and path.stem not in options.only:
             continue
         for emission in ("rest", "metal", "all") if "-rolled" in path.stem else ("rest",):
-            case = compare(path, emission, options.ways, twin)
+            case = compare(path, emission, options.ways, twin, options.half_angle)
             case["rows"] = cases.get(case["name"], case)["rows"] | case["rows"]
             cases[case["name"]] = case
             for line in table_of({case["name"]: case}):
