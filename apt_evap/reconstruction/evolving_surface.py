@@ -108,6 +108,15 @@ class IonSequence:
         """Which ions are close to the rim of the field of view, shape (n,)."""
         return self.directions[:, 2] < math.cos(_RING * self.rim)
 
+    @property
+    def ring_part(self) -> float:
+        """Part of an even flux through the field of view that is in the ring."""
+
+        def area(cosine):
+            return 1 - cosine**2 - self.growth * (1 - cosine) ** 2
+
+        return 1 - area(math.cos(_RING * self.rim)) / area(math.cos(self.rim))
+
     def part(self, first: int, every: int) -> IonSequence:
         """Every n-th ion, each of n times the volume."""
         chosen = np.ascontiguousarray(self.directions[first::every])
@@ -379,11 +388,6 @@ class EvolvingSurface:
         ions = self.ions
         counts = np.concatenate([[0], np.cumsum(ions.in_ring)])[edges]
         ring, every = np.diff(counts).astype(np.float64), np.diff(edges).astype(np.float64)
-        edge, inner = math.cos(ions.rim), math.cos(_RING * ions.rim)
-
-        def area(cosine):
-            return 1 - cosine**2 - ions.growth * (1 - cosine) ** 2
-
         memory = _RING_MEMORY * ions.radius / (nominal[-1] / len(every))
         smooth = [scipy.ndimage.gaussian_filter1d(part, memory, mode="nearest") for part in (ring, every)]
-        return smooth[0] / np.maximum(smooth[1], 1e-9) / (1 - area(inner) / area(edge))
+        return smooth[0] / np.maximum(smooth[1], 1e-9) / ions.ring_part

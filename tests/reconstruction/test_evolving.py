@@ -43,6 +43,17 @@ def test_without_phases_it_follows_the_ring_and_stays_close_to_the_cap():
     assert np.isnan(height[0, 0])
 
 
+@pytest.mark.parametrize(("left_out", "follows"), [(16, True), (6, False)])
+def test_a_flux_at_the_rim_that_no_phase_explains_is_left_to_the_cap(left_out, follows):
+    hits, labels = ions_of(8000, voltage=varying(8000))
+    rim = np.hypot(hits.x, hits.y) > 100 * np.tan(0.82 * HALF)
+    kept = ~rim | (np.cumsum(rim) % left_out > 0)
+    found = evolving(hits[kept])
+    assert found.verdict.startswith("followed by" if follows else "cap: the flux at the rim is 0.88 of that of")
+    # with a phase it is that of the phase, too
+    assert evolving(hits[kept], labels=labels[kept]).history is not None
+
+
 def test_a_layer_of_the_same_field_is_found_to_have_it():
     hits, labels = ions_of(voltage=np.full(4000, 3000.0) + np.arange(4000) * 1e-3)
     found = evolving(hits, labels=labels)
