@@ -576,7 +576,8 @@ def _fixed_point(measured):
         flux = float(ions.in_ring.mean()) / ions.ring_part
         if abs(flux - 1) > RING_GATE:
             return (
-                f"the flux at the rim is {flux:.2f} of that of the whole view, as by the crystal, and no phase is seen"
+                f"the flux at the rim is {flux:.2f} of that of the whole view, and no phase is seen: it is that of the "
+                "crystal, or the projection is wrong"
             )
         swing = _voltage_swing(measured)
         if swing > VOLTAGE_GATE:

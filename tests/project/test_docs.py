@@ -55,7 +55,8 @@ def folder(tmp_path, monkeypatch, rough_layout):
     rng = np.random.default_rng(1)
     n = 20_000
     comb = np.array([0.02725, 0.02602])  # mm, of a delay line detector
-    radius, azimuth = 36.0 * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    sine, azimuth = np.sin(np.radians(32.0)) * np.sqrt(rng.random(n)), 2 * np.pi * rng.random(n)
+    radius = 90.0 * sine / (0.5 + np.sqrt(1 - sine**2))  # an even flux with the default projection
     x, y = (np.rint(radius * part(azimuth) / step) * step for part, step in zip((np.cos, np.sin), comb, strict=True))
     measured = ae.Hits(
         x=x,
