@@ -155,7 +155,7 @@ def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
 
 def test_a_hydride_five_standard_deviations_from_its_metal_may_be_its_isotopes():
     ions = {("W", 3): 40, ("WH", 3): 12, ("Cr", 2): 3, ("Fe", 2): 10, ("H", 1): 2}
-    result = ae.spectrum(made(ions, width=1.2e-3, tail=4e-3), list(truth(ions)))
+    result = ae.spectrum(made(ions, width=1e-3, tail=3e-3), list(truth(ions)))
     (hydride,) = (ion for ion in result.ions if ion.name == "WH³⁺")
     assert "W³⁺" in hydride.others and result.composition.error["H"] > 2
 
