@@ -91,10 +91,10 @@ class IonFit:
         self._products: dict[int, Floats] = {}
         self._refresh()
         self._absent, self._own = np.zeros(self.number), np.zeros(self.number, bool)
-        self._hidden = self._unseen > 0
         self.missed, self.main, self.largest = np.zeros(self.number), np.arange(self.number), np.ones(self.number)
         self.shares = np.eye(self.number)
         """Share of the ions of each column in each peak, shape (columns, n)."""
+        self._hidden = self._clear_unseen(self.shares)
 
     def _refresh(self):
         self._diagonal = np.einsum("ij,ij->i", self._rows, self._rows)

@@ -91,10 +91,12 @@ def _gaussian(size, sigma, dtype):
 
 @lru_cache(maxsize=1)
 def places_of() -> tuple[Floats, Floats]:
-    """Points of a polar picture in radii of the disc, (n, 2), and their areas, (n,); not to be changed."""
+    """Points of a polar picture in radii of the disc, (n, 2), and their areas, (n,); read-only."""
     radii, azimuths = polar_grid(RINGS, AZIMUTHS)
     r, phi = (values.ravel() for values in np.meshgrid(radii, azimuths, indexing="ij"))
-    return np.column_stack([r * np.cos(phi), r * np.sin(phi)]), r / r.sum()
+    places, areas = np.column_stack([r * np.cos(phi), r * np.sin(phi)]), r / r.sum()
+    places.flags.writeable = areas.flags.writeable = False
+    return places, areas
 
 
 def picture_of(disc: Disc) -> Floats:

@@ -125,8 +125,8 @@ class Candidate:
         The mixture of the patterns of all radii that fits best.
     rim_change : float
         Relative change of the distance per angle from the centre to the rim of the field of view, by a lens or by the
-        flight: negative for a barrel. The scale of the projection is that at the centre. Both are fitted anew, with the
-        orientation, after the verdict, whose score and confidence are of a smaller change.
+        flight: negative for a barrel. The scale of the projection is that at the centre. Both are fitted again, with
+        the orientation, after the verdict, whose score and confidence are of a smaller change.
     scale_error : float or None
         Standard error of this scale [mm/rad]: three times that by noise, as lines and poles of a specimen are not
         those of the patterns. At a bound that was given it is the error without the bound. None if the scale was not

@@ -174,8 +174,10 @@ def slow_changes(radii: Floats, azimuths: Floats) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=1)
 def slow_of_pictures() -> tuple[Floats, Floats]:
-    """`slow_changes` of the points of a polar picture."""
-    return slow_changes(*polar_grid(RINGS, AZIMUTHS))
+    """`slow_changes` of the points of a polar picture, read-only."""
+    slow, weights = slow_changes(*polar_grid(RINGS, AZIMUTHS))
+    slow.flags.writeable = weights.flags.writeable = False
+    return slow, weights
 
 
 def flattened(disc: Disc, sigma: float) -> Floats:
