@@ -77,7 +77,7 @@ def reconstruction(
     if len(result) < FEWEST:
         raise ValueError(f"result must have at least {FEWEST} ions for a picture, got {len(result)}")
     names, species = species_of(result, ranges)
-    width, _, depth = np.ptp(result.positions, axis=0)
+    width, _, depth = result.extents
     is_long = depth > _LONG * width
     if is_long:
         heights = max(1.0, 9.5 * width / depth) + 0.8, 2.8, 3.6  # inch, each with its labels
@@ -110,7 +110,7 @@ def reconstruction(
 
 def _description(result):
     """Number of ions, size, and ions per volume near the axis."""
-    x, y, z = np.ptp(result.positions, axis=0)
+    x, y, z = result.extents
     density = density_near_axis(result)
     lines = [f"{len(result):,} ions, {x:.1f} × {y:.1f} × {z:.1f} nm"]
     if np.isfinite(density.found):

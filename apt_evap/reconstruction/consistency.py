@@ -131,9 +131,9 @@ def density_near_axis(reconstruction: Reconstruction) -> Check:
     rim = _CORE * float(np.quantile(across, 0.99))
     near = across < rim
     # from cap to cap: the depth of the apex, so that the curvature does not matter
-    depths = reconstruction.depths[near]
-    volume = math.pi * rim**2 * float(reconstruction.depths[-1] - reconstruction.depths[0])
-    value = len(depths) / volume if volume > 0 else math.nan
+    depths = reconstruction.depths
+    volume = math.pi * rim**2 * float(depths[-1] - depths[0])
+    value = np.count_nonzero(near) / volume if volume > 0 else math.nan
     small = "more than expected: the compression is too small, or ions are focused on the axis"
     large = "fewer than expected: the compression is too large, or ions are deflected from the axis"
     meaning = small if value > expected else large

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -95,15 +96,21 @@ class Reconstruction:
         """x, y and z [nm], shape (n, 3), with z out of the specimen: a right-handed frame, for crystal directions."""
         return self.positions * (1.0, 1.0, -1.0)
 
+    @cached_property
+    def extents(self) -> tuple[float, float, float]:
+        """Lengths along x, y and depth [nm]."""
+        width, height, depth = (float(np.ptp(column)) for column in self.positions.T)
+        return width, height, depth
+
+    @cached_property
+    def depths(self) -> Floats:
+        """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
+        return self.positions[:, 2] - depths_below_apex(self.positions, self.radii)
+
     @property
     def angles(self) -> Floats:
         """Polar angle of each ion on the cap [degrees], shape (n,)."""
         return polar_angles(self.positions, self.radii)
-
-    @property
-    def depths(self) -> Floats:
-        """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
-        return self.positions[:, 2] - depths_below_apex(self.positions, self.radii)
 
     def to_hits(self, frame: str = "depth") -> Hits:
         """Ions with the reconstructed positions, for files: ``ae.write("ions.pos", reconstruction.to_hits())``.
@@ -274,7 +281,7 @@ class Reconstruction:
         return len(self.positions)
 
     def __repr__(self) -> str:
-        extents = " x ".join(f"{np.ptp(column):.1f}" for column in self.positions.T)
+        extents = " x ".join(f"{extent:.1f}" for extent in self.extents)
         low, high = self.radii.min(), self.radii.max()
         radius = f"R {low:.1f} nm" if low == high else f"R {low:.1f} to {high:.1f} nm"
         names = ("field_factor", "evaporation_field", "initial_radius", "shank_angle", "compression", "efficiency")
