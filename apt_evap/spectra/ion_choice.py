@@ -188,8 +188,7 @@ class IonChoice:
         banned = self.banned - {also}
         numbers = np.asarray(chosen, int)
         atomic = self._atomic[numbers] if len(numbers) else np.zeros(0, int)
-        content = np.bincount(np.maximum(atomic, 0), np.asarray(amplitudes) * (atomic >= 0), len(self.elements))
-        part = content / max(float(np.sum(amplitudes)), 1e-9)
+        part = np.asarray(amplitudes) @ (self.atoms[numbers] > 0) / max(float(np.sum(amplitudes)), 1e-9)
         present = {self.elements[at] for at in set(atomic[atomic >= 0].tolist())}
         present |= set(GASES) if self.allowed is None else set(self.elements)
         present -= banned

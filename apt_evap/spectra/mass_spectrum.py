@@ -37,6 +37,7 @@ _CLEAR, _UNLIKE, _FEWEST = 5.0, 0.3, 30.0  # unexplained ions: in errors of coun
 _NEAR = 2.0  # errors of the calibration within which an ion may have a peak
 _FREQUENT = 0.1  # abundance over the largest of an isotope that makes a peak
 _CLEAN = 0.98  # part of a peak that one ion has, to measure its isotopes there
+_FEW_HEAVY = 1e-3  # part of the ions that is above the spectrum without a word
 _SHOWN = 8  # unexplained peaks in a text
 _PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
 
@@ -572,13 +573,15 @@ def _detected(hits):
 def _warn_of_masses(hits):
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
-        wrong = mass[hits.detected & (mass < 0)]
+        wrong, heavy = mass[hits.detected & (mass < 0)], np.count_nonzero(hits.detected & (mass >= HIGHEST))
     if len(wrong):
         warn(
             f"mass_to_charge must be > 0 [Da], got {len(wrong):,} of {len(mass):,} ions down to {wrong.min():.4g}: "
             "these are left out",
             DataWarning,
         )
+    if heavy > _FEW_HEAVY * len(mass):
+        warn(f"{heavy:,} of {len(mass):,} ions are above {HIGHEST:g} Da: these are left out", DataWarning)
 
 
 def _displaced(source, rival):

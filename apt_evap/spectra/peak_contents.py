@@ -87,7 +87,8 @@ class PeakContents:
     def __init__(self, mass: Floats) -> None:
         self.scale = PeakScale(mass)
         self.counts = self.scale.counts(mass)
-        self.places, self._smooth = find_places(self.counts)
+        broad = bool(self.scale.sigma(30.0) > _BROAD)
+        self.places, self._smooth = find_places(self.counts, not broad)
         self.seen_at = self.scale.mass(self.places) if len(self.places) else np.zeros(0)
         """m/n of the peaks [Da]."""
         self._tails, self._bases = _bases(self.scale)
@@ -97,7 +98,7 @@ class PeakContents:
         self._smooth_background = _background_basis(self.scale)
         self._mixture = np.array([*_MIXTURE[0][: len(self._tails)], *_MIXTURE[1]])
         self._start: Floats | None = None  # amplitudes of the background of the last fit
-        if len(self.places) and self.scale.sigma(30.0) > _BROAD:
+        if len(self.places) and broad:
             self.places = self._with_shoulders(self.places)
             self.seen_at = self.scale.mass(self.places)
 

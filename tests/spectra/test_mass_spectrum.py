@@ -202,12 +202,18 @@ def test_what_a_spectrum_needs_is_named():
         ae.spectrum(hits, distance=-1.0)
 
 
+@pytest.mark.parametrize("heavy", [1e30, np.inf, 500.0])
+def test_masses_above_the_spectrum_are_left_out_and_said(heavy):
+    with pytest.warns(DataWarning, match="1 of 2 ions are above 500 Da: these are left out"):
+        assert ae.spectrum(ae.Hits(mass_to_charge=[heavy, 5.0])).ions == ()
+
+
 def test_masses_below_zero_are_left_out_and_said():
     with pytest.warns(DataWarning, match=r"^mass_to_charge must be > 0 \[Da\], got 1 of 3 ions down to -3"):
         ae.spectrum(ae.Hits(mass_to_charge=[-3.0, 5.0, 6.0]))
 
 
-@pytest.mark.parametrize("mass", [[], [np.nan, np.inf, 0.0], [1e30, 5.0]])
+@pytest.mark.parametrize("mass", [[], [np.nan, 0.0, 0.1], [5.0, 7.0]])
 def test_strange_masses_have_no_peaks(mass):
     assert ae.spectrum(ae.Hits(mass_to_charge=np.array(mass))).ions == ()
 
