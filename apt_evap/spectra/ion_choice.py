@@ -27,6 +27,7 @@ UNNAMED = 40.0
 """Cost of a peak without a name: so no name may cost more, and peaks without a name bring no wrong ions."""
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
 _TRIED = 8  # best ions that are fitted in each step
+_FOLLOWING = 4  # steps after an ion that takes the place of others
 _FEWEST, _LEAST = 20.0, 1e-5  # ions of an ion, and over all ions
 _SHARED = 0.3  # of the ions of an ion, in the main peak of another that it may replace
 
@@ -216,11 +217,25 @@ class IonChoice:
 
     def choose(self, most: int = 60, start: Sequence[int] = ()) -> tuple[list[int], Floats, float]:
         """The best ions, their amplitudes, and chi-squared with costs: by steps, removals and exchanges."""
-        fit = self.fit
         chosen = list(start)
         self._share = np.zeros(len(self.elements))
-        amplitudes, chi2 = fit.solve(chosen)
-        value = chi2 + self.cost(chosen)
+        amplitudes, chi2 = self.fit.solve(chosen)
+        chosen, amplitudes, value = self._grown(chosen, amplitudes, chi2 + self.cost(chosen), most)
+        for _ in range(3):
+            self.learn_shares(chosen, amplitudes)
+            value = self.fit.solve(chosen)[1] + self.cost(chosen)
+            chosen, amplitudes, value, changed = self._exchanged(chosen, amplitudes, value)
+            chosen, amplitudes, value = self.pruned(chosen, amplitudes, value)
+            for others in () if changed else (self._with_elements, self._with_isotopes):
+                if not changed:
+                    chosen, amplitudes, value, changed = others(chosen, amplitudes, value)
+            if not changed:
+                break
+        return chosen, amplitudes, value
+
+    def _grown(self, chosen, amplitudes, value, most):
+        """With one ion more in each step, while that is better, and without those that it makes superfluous."""
+        fit = self.fit
         unnamed = np.flatnonzero(fit.contents.seen)
         for _ in range(most):
             if chosen:
@@ -241,16 +256,25 @@ class IonChoice:
                 break
             value, chosen, amplitudes = best
             chosen, amplitudes, value = self.pruned(chosen, amplitudes, value)
-        for _ in range(3):
-            self.learn_shares(chosen, amplitudes)
-            value = fit.solve(chosen)[1] + self.cost(chosen)
-            chosen, amplitudes, value, changed = self._exchanged(chosen, amplitudes, value)
-            chosen, amplitudes, value = self.pruned(chosen, amplitudes, value)
-            if not changed:
-                chosen, amplitudes, value, changed = self._with_elements(chosen, amplitudes, value)
-            if not changed:
-                break
         return chosen, amplitudes, value
+
+    def _with_isotopes(self, chosen, amplitudes, value):
+        """An atomic ion in place of those in its main peak, if another of its isotopes is a peak without a name."""
+        before, best = (chosen, amplitudes, value), (value - 1e-6, None)
+        tried = self.candidates(chosen, amplitudes)
+        tried = tried[self._atomic[tried] >= 0]
+        for unnamed in [number for number in chosen if number < self.fit.number]:
+            for other in tried[(self.fit.shares[tried, unnamed] > 0) & (self.fit.main[tried] != unnamed)].tolist():
+                main = self.fit.main[other]
+                start = [*(n for n in chosen if n != unnamed and self.fit.main[n] != main), other]
+                trial, chi2 = self.fit.solve(start)
+                grown = self._grown(*self.pruned(start, trial, chi2 + self.cost(start)), _FOLLOWING)
+                if other in grown[0] and grown[2] < best[0]:
+                    best = grown[2], grown
+        if best[1] is None:
+            self.learn_shares(*before[:2])
+            return *before, False
+        return *best[1], True
 
     def _with_elements(self, chosen, amplitudes, value):
         """All atomic ions of one more element at once, in place of those of their peaks, while that is better."""

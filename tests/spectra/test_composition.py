@@ -60,6 +60,16 @@ def test_oxides_of_an_element_that_is_rare_as_an_atom_are_tried():
     assert distance(result.composition, truth(ions)) < 1.0
 
 
+def test_an_isotope_without_a_name_brings_its_ion():
+    """Broad Fe2+ was Si+ and Si2 2+ beside an unnamed 26.97 Da, 54Fe2+: L1 52 at.%, now 2.8, Si+ below Fe2+."""
+    ions = {("Fe", 1): 40, ("Fe", 2): 16, ("Ni", 1): 3, ("Ni", 2): 1.2, ("Si", 1): 1, ("Si", 2): 0.02, ("Ta", 1): 10}
+    ions |= {("Ag", 1): 1, ("H", 1): 2}
+    hits = made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3, error=(4e-4, -2e-4))
+    result = ae.spectrum(hits, list(truth(ions)))
+    assert {"Fe⁺", "Fe²⁺", "Ni⁺"} <= {ion.name for ion in result.ions}
+    assert distance(result.composition, truth(ions)) < 4
+
+
 def test_two_sharp_peaks_side_by_side_are_two():
     """O2+ 3.7 standard deviations beside 64Zn2+, with a dip between them. Measured 0.4 at.%; as one peak 40 at.%."""
     ions = {("Zn", 1): 18, ("Zn", 2): 22, ("O", 1): 11, ("O2", 1): 17, ("ZnO", 1): 1.5, ("H", 1): 4}
