@@ -433,7 +433,8 @@ def follow_surface(
     places, angles = cap.geometry.places(cap.hits, cap.radii)
     voltages, factors, jumps, why = _relative_voltages(cap.hits, cap)
     radius, growth = _growth_of(cap, factors if jumps else 1.0)
-    twin_errors = None if twin is None else TwinErrors.of(twin, rim)  # a wrong one is refused before the passes
+    way = "ring" if names else "volume"
+    twin_errors = None if twin is None else TwinErrors.of(twin, rim, way)  # a wrong one is refused before the passes
     ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius, growth)
     measured = _Measured(ions, voltages, names, own, labels is not None, jumps)
     every = -(-len(cap) // _ION_LIMIT)
@@ -444,7 +445,7 @@ def follow_surface(
     found = _placed(cap, measured, fixed, every, why, thinned)
     if twin is None or twin_errors is None:
         return found
-    if found.followed_by == "volume":
+    if names and found.followed_by == "volume":
         twin_errors = TwinErrors.of(twin, rim, "volume")
     return _corrected(found, twin_errors, ions.directions)
 

@@ -84,12 +84,16 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     }  # fmt: skip
 
     def evolving(directions, **more):
-        hits = ae.Hits(x=100 * directions[:, 0] / directions[:, 2], y=100 * directions[:, 1] / directions[:, 2])
-        return ae.reconstruct(hits, shape="evolving", **known, **more)
+        elements = np.where(np.random.default_rng(3).random(len(directions)) < 0.05, "Mg", "Al")
+        x, y = (100 * directions[:, side] / directions[:, 2] for side in (0, 1))
+        return ae.reconstruct(ae.Hits(x=x, y=y, extra={"element": elements}), shape="evolving", **known, **more)
 
     directions = patterned(5000, np.random.default_rng(6))
     plain, found = evolving(directions), evolving(directions, twin=run)
-    assert ways[-1] == found.followed_by == "volume"
+    assert ways == [found.followed_by] == ["volume"]
+    # of a solute without a contrast this is not known before
+    assert "no solute has a contrast" in evolving(directions, twin=run, solutes=("Mg",)).verdict
+    assert ways[1:] == ["ring", "volume"]
     # exp(0.019): the gain of the test above
     assert found.verdict == plain.verdict + (
         "; the twin is used: by its density the ions are 1.019 times as likely as by an even one, 1.015 times in the "
@@ -116,7 +120,7 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     few = evolving(flat[:50], twin=run)
     assert few.verdict == "cap: 50 ions, fewer than 2,000"
 
-    def refuse(run, rim):
+    def refuse(run, rim, way):
         raise ValueError("twin must be another one")
 
     # before the passes, which take seconds
