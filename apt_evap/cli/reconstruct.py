@@ -335,7 +335,6 @@ def _ions(options, output):
     """Ions of the file, the constants that it determines, the orientation of a run, and whether its ions roll."""
     from apt_evap.cli._files import in_real_units, read
     from apt_evap.detection.hits import Hits
-    from apt_evap.emission.perturbations import Unperturbed
     from apt_evap.maps.crystallography.orientation import Orientation
     from apt_evap.reconstruction.constants import run_constants
     from apt_evap.simulation.config.perturbation_text import read_perturbation
@@ -348,9 +347,9 @@ def _ions(options, output):
         perturbation = run.first_perturbation
         if options.perturbation is not None:
             perturbation = read_perturbation(options.perturbation)
-        rolled = not isinstance(perturbation, Unperturbed)
-        known = Orientation.known(run.settings["tip"])
-        return run.hits(perturbation), run_constants(run, _field(options)), known, rolled
+        rolled = perturbation != read_perturbation("Unperturbed")
+        orientation = Orientation.known(run.settings["tip"])
+        return run.hits(perturbation), run_constants(run, _field(options)), orientation, rolled
     if not isinstance(content, Hits):
         raise ValueError(f"reconstruct needs ions or a run, {options.file!r} contains a map")
     for name in ("real_units", "perturbation"):

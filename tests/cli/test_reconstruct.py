@@ -81,6 +81,14 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
     few = json.loads(capsys.readouterr().out)["settings"]
     assert few["compression"] == 1.5 and few["field_factor"] < 2
     assert main([*command, "--force"]) == 0 and "RMS errors: " in capsys.readouterr().out
+    # sizes count on the scatter of the emission
+    rolled, plain = [], ae.Run.hits
+    monkeypatch.setattr(ae.Run, "hits", lambda run, _: plain(run, ae.Unperturbed()))
+    monkeypatch.setattr(reconstruct, "_tell_check", lambda *arguments: rolled.append(arguments[-1]))
+    for emission in ("Unperturbed", "RollUp:0.2,0.1"):
+        words = ["--shape", "evolving", "--check", "--perturbation", emission]
+        assert main([*command, "--force", *words]) == 0
+    assert rolled == [False, True]
 
 
 @pytest.mark.parametrize(
