@@ -121,7 +121,7 @@ def execute(options: argparse.Namespace) -> int:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     picture = output.with_suffix(".png") if options.picture is None else picture_path(options.picture)
     check_output(picture, is_picture, options.force)
-    hits, known, crystal = _ions(options, output)
+    hits, known, crystal, rolled = _ions(options, output)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
     if (extent := _extent(options, hits)) is not None:
@@ -157,7 +157,9 @@ def execute(options: argparse.Namespace) -> int:
     if isinstance(reconstruction, EvolvingReconstruction):
         result["surface"] = _tell_surface(options, reconstruction)
     if options.check is not None:
-        result["check"] = _tell_check(options, reconstruction, material, axis, not options.check and crystal is None)
+        result["check"] = _tell_check(
+            options, reconstruction, material, axis, not options.check and crystal is None, rolled
+        )
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
         result["errors"] = errors.to_dict()
@@ -302,25 +304,27 @@ def _crystal(options, settings, crystal):
         raise ValueError(f"--check: {error}") from error
 
 
-def _tell_check(options, reconstruction, material, axis, assumed):
+def _tell_check(options, reconstruction, material, axis, assumed, rolled=False):
     """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
     from apt_evap.reconstruction.phase_size import phase_sizes
-    from apt_evap.reconstruction.position_errors import CONSTANT_ERRORS, LOCAL_SCATTER
+    from apt_evap.reconstruction.position_errors import CONSTANT_ERRORS, LOCAL_SCATTER, ROLLED_SCATTER
     from apt_evap.reconstruction.specimen_check import check_specimen
 
     if not any(phase.error == phase.error for phase in reconstruction.phases):
         tell(options, "nothing to check: no evaporation field of a phase was found")
         return None
-    sizes = phase_sizes(reconstruction)
+    scatter = ROLLED_SCATTER if rolled else LOCAL_SCATTER
+    sizes = phase_sizes(reconstruction, local=scatter)
     for size in sizes:
         tell(options, str(size))
-    counted = {**CONSTANT_ERRORS, "scatter_along": LOCAL_SCATTER[0], "scatter_across": LOCAL_SCATTER[1]}
+    counted = {**CONSTANT_ERRORS, "scatter_along": scatter[0], "scatter_across": scatter[1]}
     if sizes:
         constants = ", ".join(f"{name} {error:.0%}" for name, error in CONSTANT_ERRORS.items())
         tell(
             options,
             f"errors of sizes count on {constants}, and on places along the surface that scatter by "
-            f"{LOCAL_SCATTER[0]:.2f} nm, as of ions at rest (Al, R = 12 nm): those of ions that roll scatter more",
+            f"{scatter[0]:.2f} nm, as of ions {'that roll' if rolled else 'at rest'} (Al, R = 12 nm)"
+            + ("" if rolled else f": those of ions that roll scatter by {ROLLED_SCATTER[0]:.2f} nm"),
         )
     check = check_specimen(reconstruction, material, axis=axis)
     along = " ".join(f"{part:g}" for part in axis)
@@ -331,7 +335,7 @@ def _tell_check(options, reconstruction, material, axis, assumed):
 
 
 def _ions(options, output):
-    """Ions of the file, the constants that it determines, and the orientation of a run."""
+    """Ions of the file, the constants that it determines, the orientation of a run, and whether its ions roll."""
     from apt_evap.cli._files import in_real_units, read
     from apt_evap.detection.hits import Hits
     from apt_evap.maps.crystallography.orientation import Orientation
@@ -346,13 +350,15 @@ def _ions(options, output):
         perturbation = run.first_perturbation
         if options.perturbation is not None:
             perturbation = read_perturbation(options.perturbation)
-        return run.hits(perturbation), run_constants(run, _field(options)), Orientation.known(run.settings["tip"])
+        rolled = perturbation != read_perturbation("Unperturbed")
+        orientation = Orientation.known(run.settings["tip"])
+        return run.hits(perturbation), run_constants(run, _field(options)), orientation, rolled
     if not isinstance(content, Hits):
         raise ValueError(f"reconstruct needs ions or a run, {options.file!r} contains a map")
     for name in ("real_units", "perturbation"):
         if getattr(options, name) is not None:
             raise ValueError(f"--{name.replace('_', '-')} needs a run (.h5), {options.file!r} contains measured ions")
-    return content, {}, None
+    return content, {}, None, False
 
 
 def _ions_of_large_file(options, output):

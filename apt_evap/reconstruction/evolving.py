@@ -2,7 +2,7 @@
 
 The steps of `follow_surface`: the cap, a pass with the recession from the ring, the phases at the positions of this
 pass, then passes with the recession from voltage and phases, each with the evaporation fields that the pass before has
-found.
+found. Without a phase, one pass with the recession of the cap.
 """
 
 from __future__ import annotations
@@ -46,16 +46,17 @@ WIDEST_VIEW = 60.0
 """Largest half angle of the field of view [degrees]: beyond, the response of a sphere does not describe a specimen."""
 
 EMISSION_GATE = 0.33
-"""Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 at rest or with the rolling of aluminium,
-0.34 to 0.47 if all ions roll, and then the surface is no better than the cap."""
+"""Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 for aluminium at rest or as it rolls,
+0.34 to 0.47 if all ions roll, and then the surface is no better than the cap. No sign of rolling alone: W, Mg and Pt at
+rest have 0.35 or 0.36 in views of 20 degrees."""
 VOLTAGE_GATE = 0.02
-"""Largest change of the voltage about its trend without a phase: 0.005 for pure aluminium, 0.007 for spheres, 0.033 for
-a layer of 1.15 times the field across the whole specimen."""
+"""Largest change of the voltage about its trend without a phase: 0.005 to 0.007 for seven pure crystals, 0.020 for the
+planes of Fe [001], 0.007 for spheres, 0.033 for a layer of 1.15 times the field across the whole specimen."""
 
-RING_GATE = 0.1
-"""Largest relative difference of the flux at the rim to that of the whole view, where no phase is seen. Aluminium,
-which chose it, has 0.03 and 0.00 in views of 30 and 35 degrees, where the surface is better than the cap, 0.25, 0.28
-and 0.11 in 20, 22 and 25 degrees, where it is worse: there the flux is that of the crystal."""
+RIM_GATE = 0.09
+"""Largest difference to 1 of the flux at the rim over that of the whole view in stretches of matrix: 0.00 to 0.08 in
+views of 30 and 35 degrees of aluminium with spheres, 0.09 to 0.13 in 25 degrees. Beyond, it is that of the crystal, and
+depths are 0.33 in place of 0.07 nm (sphere of 0.8)."""
 
 VOLTAGE_ERROR = 0.017
 """Relative error of V F = F_evap: RMS of V F / F_evap - 1 in the matrix of a pure specimen and of three with spheres,
@@ -245,7 +246,7 @@ class EvolvingReconstruction(Reconstruction):
 
     @property
     def followed_by(self) -> str:
-        """What the recession of the last pass followed from: the "ring", or voltage and phases, "surface"."""
+        """What the recession follows from: the "volume" of the ions without a phase, the "ring", or the "surface"."""
         return self._followed[1].way  # type: ignore[no-any-return]
 
     @property
@@ -276,7 +277,7 @@ class EvolvingReconstruction(Reconstruction):
         voltage : float
             Factor of the voltages.
         by : str, optional
-            Recession from the "ring" or by voltage and phases, "surface"; by default that of this reconstruction.
+            Recession as for `EvolvingSurface.integrate`; by default that of this reconstruction.
 
         Returns
         -------
@@ -284,8 +285,9 @@ class EvolvingReconstruction(Reconstruction):
         """
         measured, fixed = self._followed
         surface = EvolvingSurface(ions)
-        if (by or fixed.way) == "ring":
-            return surface.integrate().positions
+        by = by or fixed.way
+        if by != "surface":
+            return surface.integrate(recession=by).positions
         depths = measured.ions.depths[1:]
         voltages = (voltage * measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level)[rows]
         added = np.broadcast_to(np.asarray(changes, np.float64), len(fixed.features))
@@ -294,7 +296,7 @@ class EvolvingReconstruction(Reconstruction):
             for one, change in zip(fixed.features, added, strict=True)
         ]
         fields = fixed.fields[rows] + sum(change * one.membership for one, change in zip(features, added, strict=True))
-        places = fixed.positions[rows]
+        places = fixed.positions[rows] if features else ions.directions  # of no phase nothing is continued
         for _ in range(2):  # the phases where these ions were found, then where those of the changed sequence are
             outside = continued(features, places, ions.in_ring)[0]
             places = surface.integrate(voltages, fields, outside, "surface").positions
@@ -306,10 +308,14 @@ class EvolvingReconstruction(Reconstruction):
         By `VOLTAGE_ERROR`, and by the evaporation field of each phase, one standard error of it; without phases at the
         rim of the field of view by the voltage, which tells of the recession a second time.
         """
-        if all(np.isnan(one.error) for one in self.phases):
+        ions, measured = self.sequence, self._followed[0]
+        known = self.followed_by == "volume" or any(one.error == one.error for one in self.phases)
+        if measured.voltages is None or not known:
             return []
-        ions = self.sequence
         usual = self.again(ions)
+        if self.followed_by == "volume":
+            level = float(np.mean(measured.voltages * EvolvingSurface(ions).integrate(recession="volume").fields))
+            return [self.again(ions, voltage=1 / level, by="surface") - usual]
         if self.followed_by == "ring":
             return [self.again(ions, by="surface") - usual]
         errors = np.diag([one.error for one, _ in self.found_features])
@@ -402,6 +408,7 @@ class _Fixed(NamedTuple):
     ways: list[Continuation]
     ratios: Floats
     errors: Floats
+    rim: float | None = None  # flux there over that of the whole view, in the matrix, if it is that of the crystal
 
 
 def follow_surface(
@@ -426,7 +433,8 @@ def follow_surface(
     places, angles = cap.geometry.places(cap.hits, cap.radii)
     voltages, factors, jumps, why = _relative_voltages(cap.hits, cap)
     radius, growth = _growth_of(cap, factors if jumps else 1.0)
-    twin_errors = None if twin is None else TwinErrors.of(twin, rim)  # a wrong one is refused before the passes
+    way = "ring" if names else "volume"
+    twin_errors = None if twin is None else TwinErrors.of(twin, rim, way)  # a wrong one is refused before the passes
     ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius, growth)
     measured = _Measured(ions, voltages, names, own, labels is not None, jumps)
     every = -(-len(cap) // _ION_LIMIT)
@@ -435,7 +443,11 @@ def follow_surface(
     if isinstance(fixed, str):
         return _as_cap(cap, fixed + (f" ({why})" if why else ""))
     found = _placed(cap, measured, fixed, every, why, thinned)
-    return found if twin_errors is None else _corrected(found, twin_errors, ions.directions)
+    if twin is None or twin_errors is None:
+        return found
+    if names and found.followed_by == "volume":
+        twin_errors = TwinErrors.of(twin, rim, "volume")
+    return _corrected(found, twin_errors, ions.directions)
 
 
 def _check_sequence(hits):
@@ -556,29 +568,24 @@ def _fixed_point(measured):
     ions, own = measured.ions, measured.own
     n = len(ions.directions)
     surface = EvolvingSurface(ions)
-    ring = surface.integrate()
+    ring = surface.integrate() if own else None
+    places = None if ring is None else ring.positions
     halves = np.random.default_rng(0).integers(0, 2, n).astype(bool)
     contrasts: list[SoluteContrast] = []
     if not measured.has_labels:
-        contrasts = [solute_contrast(ring.positions, one, halves, ions.volume) for one in own]
+        contrasts = [solute_contrast(places, one, halves, ions.volume) for one in own]
     seen = [k for k in range(len(own)) if measured.has_labels or contrasts[k].is_seen]
     ratios = np.ones(len(own))
     nothing = _Fixed(
-        way="ring", level=1.0, trend=np.array([1.0, 0.0]), features=[], contrasts=contrasts, fields=np.ones(n),
-        positions=ring.positions, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
+        way="ring" if seen else "volume", level=1.0, trend=np.array([1.0, 0.0]), features=[], contrasts=contrasts,
+        fields=np.ones(n), positions=places, ways=[], ratios=ratios, errors=np.full(len(own), np.nan),
     )  # fmt: skip
-    _, features = _features(measured, seen, contrasts, halves, ring.positions, ratios)
+    _, features = _features(measured, seen, contrasts, halves, places, ratios)
     others = np.any([one.members for one in features], axis=0) if features else None
     contrast = _density_contrast(ions, others)
     if contrast > EMISSION_GATE:
         return f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
     if not seen:
-        flux = float(ions.in_ring.mean()) / ions.ring_part
-        if abs(flux - 1) > RING_GATE:
-            return (
-                f"the flux at the rim is {flux:.2f} of that of the whole view, and no phase is seen: it is that of the "
-                "crystal, or the projection is wrong"
-            )
         swing = _voltage_swing(measured)
         if swing > VOLTAGE_GATE:
             return (
@@ -586,20 +593,22 @@ def _fixed_point(measured):
                 "and neither labels nor solutes show one"
             )
         return nothing
-    _, ways = continued(features, ring.positions, ions.in_ring)
+    _, ways = continued(features, places, ions.in_ring)
     reaches = [way for way in ways if way.way != "none"]
+    rim = _matrix_rim(ions, features)
     if measured.voltages is None:
         if reaches:
             worst = max(way.share for way in reaches)
             return f"a phase reaches the rim of the field of view, {worst:.2f} of the ring, and the voltage is needed"
-        return nothing._replace(features=features, ways=ways)
+        return nothing._replace(way="ring" if rim is None else "volume", rim=rim, features=features, ways=ways)
     # On a shank the voltage without its slow trend, by the matrix in a pass without voltage: it is not proportional to
     # the radius. With a constant radius a trend would be one of the phases: depth errors 0.138 in place of 0.122 nm.
     depths, trend = ions.depths[1:], nothing.trend
     if ions.growth > 0:
         trend = _trend(measured.voltages * ring.fields, _matrix(features), depths)
     voltages = measured.voltages / (trend[0] + trend[1] * depths)
-    start = nothing._replace(trend=trend, level=_level(voltages, ring.fields, features, n), features=features)
+    level = _level(voltages, ring.fields, features, n)
+    start = nothing._replace(trend=trend, level=level, features=features, rim=rim)
     fixed = _found_by_passes(measured, start, surface, ring, voltages, seen, halves)
     if rough := [way for way in fixed.ways if way.way == "ring"]:
         flatness = max(way.flatness for way in rough)
@@ -621,7 +630,7 @@ def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
         before, thresholds = found.positions, _ion_fields(features)
         # Without a phase at the rim the flux there is the better measure: depths 0.148 in place of 0.167 nm, and 16 in
         # place of 17 % on the wrong side, of a sphere of 1.2 times the field. It does not depend on the fields.
-        by = "ring" if all(one.way == "none" for one in ways) else "surface"
+        by = "ring" if start.rim is None and all(one.way == "none" for one in ways) else "surface"
         found = ring if by == "ring" else surface.integrate(voltages / level, thresholds, outside, by)
         values = found.fields * voltages / level
         compositions, features = _features(measured, seen, start.contrasts, halves, found.positions, ratios)
@@ -634,7 +643,10 @@ def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
         ratios[seen] = given if by == "ring" else np.clip(_extrapolated(used, given, *last), *_FIELD_LIMITS)
     ratios = ratios.copy()
     ratios[seen] = given
-    return _Fixed(by, level, start.trend, features, start.contrasts, thresholds, before, ways, ratios, errors)
+    return start._replace(
+        way=by, level=level, features=features, fields=thresholds, positions=before, ways=ways, ratios=ratios,
+        errors=errors,
+    )  # fmt: skip
 
 
 def _extrapolated(used, given, used_before, given_before):
@@ -698,8 +710,8 @@ def _trend(values, weights, depths):
     return np.array([start, slope])
 
 
-def _level(voltages, at_ions, features, n):
-    """Voltage of the matrix on a sphere: of the longest stretch of matrix, else such that V F of the matrix is 1."""
+def _clean_blocks(features, n):
+    """Block of each ion, and which blocks of the sequence are of matrix only."""
     blocks = np.minimum(np.arange(n) * _CLEAN_BLOCKS // n, _CLEAN_BLOCKS - 1)
     counts = np.bincount(blocks, minlength=_CLEAN_BLOCKS)
     clean = np.ones(_CLEAN_BLOCKS, bool)
@@ -708,6 +720,21 @@ def _level(voltages, at_ions, features, n):
         share = np.bincount(blocks, np.clip(one.membership, 0, 1) if one.background == 0 else one.membership) / counts
         clean &= share < _CLEAN + 1.5 * noise
     clean[: int(0.04 * _CLEAN_BLOCKS)] = False
+    return blocks, clean
+
+
+def _matrix_rim(ions, features):
+    """Flux at the rim over that of the whole view in stretches of matrix, if it is not that of a sphere; else None."""
+    blocks, clean = _clean_blocks(features, len(ions.directions))
+    if not clean.any():
+        return None
+    rim = float(ions.in_ring[clean[blocks]].mean()) / ions.ring_part
+    return rim if abs(rim - 1) > RIM_GATE else None
+
+
+def _level(voltages, at_ions, features, n):
+    """Voltage of the matrix on a sphere: of the longest stretch of matrix, else such that V F of the matrix is 1."""
+    blocks, clean = _clean_blocks(features, n)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], clean, [False]]).astype(int)))
     starts, stops = edges[::2], edges[1::2]
     if len(starts):
@@ -791,9 +818,12 @@ def _placed(cap, measured, fixed, every, why, thinned):
 
 def _corrected(found, twin, directions):
     """The reconstruction without the mean errors of the twin, unless its density does not describe the measured one."""
-    gain = twin.gain(directions)
-    said = f"; the twin {{}}: by its density the ions are {math.exp(gain):.3f} times as likely as by an even one"
-    if gain <= 0:
+    whole, worst = twin.gains(directions)
+    said = (
+        f"; the twin {{}}: by its density the ions are {math.exp(whole):.3f} times as likely as by an even one, "
+        f"{math.exp(worst):.3f} times in the worst half of the view"
+    )
+    if min(whole, worst) <= 0:
         return replace(found, verdict=found.verdict + said.format("is not used"))
     shifts = twin.shifts_at(directions, found.radii) * (1.0, 1.0, -1.0)  # depth in place of z
     return replace(
@@ -805,13 +835,19 @@ def _verdict(fixed, measured, why):
     """One sentence on what the surface was followed by."""
     share = max((way.share for way in fixed.ways), default=0.0)
     jumps = f"; {measured.jumps} jumps or restarts of the voltage were taken out" if measured.jumps else ""
-    if fixed.way == "ring":
-        if measured.names and not fixed.features:
+    crystal = f", where the flux is that of the crystal, {fixed.rim:.2f} of the view" if fixed.rim else ""
+    if fixed.way == "volume":
+        found = "no phase is known"
+        if fixed.features:
+            found = f"at most {share:.2f} of the rim is of a phase{crystal}, {why}"
+        elif measured.names:
             best = max(one.contrast for one in fixed.contrasts)
-            return f"followed by the flux at the rim: no solute has a contrast over its noise, at most {best:.1f}"
+            found = f"no solute has a contrast over its noise, at most {best:.1f}"
+        return f"followed by the volume of the ions, as the cap: {found}"
+    if fixed.way == "ring":
         because = f", {why}" if why and measured.names else ""
         return f"followed by the flux at the rim: at most {share:.2f} of it is of a phase{because}{jumps}"
     how = {way.way for way in fixed.ways} - {"none"}
     ways = {"plane": "continued as a plane", "ring": "continued from the ions at its azimuth"}
     beyond = f", {' and '.join(ways[way] for way in sorted(how))}" if how else ""
-    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{beyond}{jumps}"
+    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{crystal}{beyond}{jumps}"

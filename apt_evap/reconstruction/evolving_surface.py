@@ -218,14 +218,16 @@ class EvolvingSurface:
         outside : callable, optional
             Evaporation field at positions beyond the field of view, shape (..., 3), relative to that of the matrix.
         recession : str
-            "ring": from the flux in the ring, with the flux of a sphere beyond the field of view. "surface": such that
-            the mean of V F / F_evap stays 1, and the surface beyond evaporates by its own field.
+            "ring": from the flux in the ring, with the flux of a sphere beyond the field of view. "volume": that of a
+            cap that keeps its shape, by the volume of the ions, which lie on this sphere in the directions that they
+            come from. "surface": such that the mean of V F / F_evap stays 1, and the surface beyond evaporates by its
+            own field.
 
         Returns
         -------
         SurfacePass
         """
-        recession = check_choice(recession, "recession", ("ring", "surface"))
+        recession = check_choice(recession, "recession", ("ring", "volume", "surface"))
         ions, transform = self.ions, self.transform
         n, growth, degrees = len(ions.directions), ions.growth, transform.degrees
         voltages = np.ones(n) if voltages is None else voltages
@@ -255,7 +257,7 @@ class EvolvingSurface:
             expected = volume / (ions.swept * radius**2)
             mean = float(np.mean(voltages[chosen] * at_surface[:, 0] / fields[chosen])) if volume else 1.0
             control = float(np.clip(_GAIN * (1 - mean), -_LARGEST_EXPONENT, _LARGEST_EXPONENT))
-            sunk = expected * (ring[k] if recession == "ring" else math.exp(control))
+            sunk = expected * {"ring": ring[k], "volume": 1.0, "surface": math.exp(control)}[recession]
             # 3. volume that leaves each node per solid angle: of the ions, and beyond the field of view
             gone = ions.volume * counts / self._area
             seen = (self.nodes[..., 2] + deflection[0] * self._axis[0] + deflection[1] * self._axis[1]) / np.sqrt(
@@ -292,7 +294,7 @@ class EvolvingSurface:
             depth += sunk
         first, below, factors, means, folds = kept
         record = SurfaceSteps(edges, first, below, factors, means, ring, folds, self.settled(shapes, below))
-        return self._place(apex, record)
+        return self._place(apex, record, 0.0 if recession == "volume" else 1.0)
 
     def settled(self, shapes: Coefficients, depths: Floats) -> Coefficients:
         """Shapes by the ions before and after each step: averaged over the depth, without the delay of the damping.
@@ -333,8 +335,8 @@ class EvolvingSurface:
         found: Coefficients = np.ascontiguousarray((1 - later) * first + later * second).view(np.complex128)[..., 0]
         return found
 
-    def _place(self, apex, steps):
-        """The ions on the shapes of their steps."""
+    def _place(self, apex, steps, tall):
+        """The ions on the shapes of their steps, whose heights are taken times a factor."""
         ions, transform, growth = self.ions, self.transform, self.ions.growth
         positions, at_ions = np.empty((len(apex), 3)), np.empty(len(apex))
         for k, (depth, height) in enumerate(zip(steps.depths, steps.shapes, strict=True)):
@@ -346,7 +348,7 @@ class EvolvingSurface:
             )
             directions, values, _ = self.origins(ions.directions[chosen], deflection, np.stack([heights, 1 + excess]))
             within = apex[chosen] - depth
-            positions[chosen] = (radius + values[:, :1] + (growth * within)[:, None]) * directions
+            positions[chosen] = (radius + tall * values[:, :1] + (growth * within)[:, None]) * directions
             positions[chosen, 2] -= (depth + within) * (1 + growth)
             at_ions[chosen] = values[:, 1]
         return SurfacePass(positions, at_ions, apex, steps)

@@ -28,6 +28,7 @@ _LARGEST = 0.2  # of the radius: scatter of a twin whose map of origins does not
 _FITS = 3  # of radius and compression, each within the field of view by the one before
 _WIDTH = math.radians(3.0)  # of the Gaussian of a density on the detector
 _BINS = 61
+_HALVES = 16  # of the field of view, in which a twin has to be that of the matrix: one grain of two is a part of it
 _DOUBT = 0.5  # of the mean errors: a twin of another radius, of an orientation that is wrong by degrees
 _FLOOR = 0.05  # of a density: a cell without ions of the twin does not decide alone
 
@@ -56,7 +57,7 @@ class TwinErrors:
     rim: float
 
     @classmethod
-    def of(cls, run: Run, rim: float) -> TwinErrors:
+    def of(cls, run: Run, rim: float, recession: str = "ring") -> TwinErrors:
         """Reconstruct a run in the same field of view as a measurement, with the constants that fit its sites best."""
         volume, distance = _atomic_volume(run), run.detector.distance
         hits = run.hits(run.first_perturbation)
@@ -84,7 +85,7 @@ class TwinErrors:
         ions = IonSequence(np.column_stack([places, np.cos(angles)]), cap.geometry.volume, rim, radius)
         every = -(-len(cap) // _MOST)
         ions, sites = ions.part(0, every), run.emissions.positions[rows[::every]]
-        errors = sites - EvolvingSurface(ions).integrate().positions
+        errors = sites - EvolvingSurface(ions).integrate(recession=recession).positions
         kept = ions.depths[1:] > _FIRST_SHAPE * radius
         if np.count_nonzero(kept) < _FEWEST / 2:
             raise ValueError(f"twin must be deeper than 0.2 of its radius, got {ions.depths[-1] / radius:.2f}")
@@ -100,21 +101,27 @@ class TwinErrors:
     def __post_init__(self):
         object.__setattr__(self, "_tree", scipy.spatial.cKDTree(self.directions))
 
-    def gain(self, directions: Floats) -> float:
+    def gains(self, directions: Floats) -> tuple[float, float]:
         """Mean logarithm of the density of the twin on the cap at ions, relative to that of an even flux.
 
-        It is above 0 if the measured density is closer to that of the twin than to an even one.
+        It is above 0 if the measured density is closer to that of the twin than to an even one: in the whole field of
+        view, and in the half of it where this is smallest, with both densities normalised there.
         """
         rim = math.sin(self.rim)  # an even flux is even in x / R and y / R
         edges = np.linspace(-1.02 * rim, 1.02 * rim, _BINS + 1)
-        centres = (edges[1:] + edges[:-1]) / 2
-        inside = centres[:, None] ** 2 + centres**2 < rim**2
+        x, y = np.meshgrid(*[(edges[1:] + edges[:-1]) / 2] * 2, indexing="ij")
+        inside = x**2 + y**2 < rim**2
         width = _WIDTH / (edges[1] - edges[0])
         own, measured = (_counts(part, edges) for part in (self.directions, directions))
         seen = np.maximum(scipy.ndimage.gaussian_filter(inside.astype(float), width), _FLOOR)
-        density = scipy.ndimage.gaussian_filter(own, width) / seen
-        density /= density[inside].mean()
-        return float((measured * np.log(np.maximum(density, _FLOOR)))[inside].sum() / measured[inside].sum())
+        density = np.maximum(scipy.ndimage.gaussian_filter(own, width) / seen, _FLOOR * own.sum() / inside.sum())
+
+        def gain(cells):
+            logarithms = np.log(density[cells] / density[cells].mean())
+            return float((measured[cells] * logarithms).sum() / max(measured[cells].sum(), 1))
+
+        turns = np.arange(_HALVES) * (2 * math.pi / _HALVES)
+        return gain(inside), min(gain(inside & (x * math.cos(turn) + y * math.sin(turn) > 0)) for turn in turns)
 
     def shifts_at(self, directions: Floats, radii: Floats) -> Floats:
         """Mean error of the nearest ions of the twin, at directions on caps of some radii [nm], shape (n, 3)."""

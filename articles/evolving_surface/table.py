@@ -38,8 +38,9 @@ GEOMETRIES = {
     "sphere_high-rolled (all)": "sphere, 1.2, all ions roll", "grains": "two grains",
 }  # fmt: skip
 GEOMETRIES |= {
-    f"{name} (20°)": f"{GEOMETRIES[name]}, half angle of 20°"
-    for name in ("pure", "sphere_low", "sphere_high", "layer_high")
+    f"{name} ({angle}°)": f"{GEOMETRIES[name]}, half angle of {angle}°"
+    for angle in (20, 25)
+    for name in ("pure", "sphere_low", "sphere_high", "layer_high", "two_spheres", "core_shell")
 }
 PHASE_FIELDS = {
     "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
@@ -150,9 +151,9 @@ def coverage(found, sites, errors):
 def ways_of(base, emission, regions):
     """Methods beside the cap, and how each calls for its phases."""
     if not regions:
-        return {"ring": ()}
+        return {"volume": ()}
     if base == "grains":
-        return {"ring": (), "labels": None}
+        return {"volume": (), "labels": None}
     if base == "alloy_sphere":
         return {"labels": None, "solute": ("Cu",)}
     ways = {"labels": None}
@@ -201,7 +202,7 @@ def compare(path, emission="rest", chosen=None, twin=None, half_angle=HALF_ANGLE
             continue
         factors = factors_of_map(hits, half_angle) if way == "constants of the map" else (1.0, 1.0, 1.0)
         rows[way] = [judged(reconstructed(hits, factors, **how), truth)]
-        if twin is not None and way in ("labels", "ring"):
+        if twin is not None and way in ("labels", "volume"):
             rows[f"{way}, twin"] = [judged(reconstructed(hits, twin=twin, **how), truth)]
     true = PHASE_FIELDS.get(base, [])
     view = "" if half_angle == HALF_ANGLE else f" ({half_angle:g}°)"

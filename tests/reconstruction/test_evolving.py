@@ -29,29 +29,48 @@ def evolving(hits, **changes):
     return ae.reconstruct(hits, shape="evolving", **({"radius": 13.0} | KNOWN | changes))
 
 
-def test_without_phases_it_follows_the_ring_and_stays_close_to_the_cap():
+def test_without_phases_it_follows_the_volume_and_stays_close_to_the_cap():
     hits, _ = ions_of()
     found, cap = evolving(hits), ae.reconstruct(hits, radius=13.0, **KNOWN)
-    assert found.verdict == "followed by the flux at the rim: at most 0.00 of it is of a phase"
+    assert found.verdict == "followed by the volume of the ions, as the cap: no phase is known"
     # the flux is even: the noise of 4,000 ions
     assert np.abs(found.positions - cap.positions).mean() < 0.05
     assert (np.diff(found.depths) > 0).all()
-    assert found.history.recession == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(found.history.recession, 1.0, rtol=1e-12)
+    # on the sphere, where the surface says that they come from
+    centres = np.array([0.0, 0.0, -13.0]) - found.depths[:, None] * [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(np.linalg.norm(found.specimen_positions - centres, axis=1), 13.0, rtol=1e-12)
     edges, height, field = found.history.map_at(0.5, bins=16)
     assert edges[-1] == pytest.approx(np.sin(HALF), rel=1e-3)
     assert np.nanmax(np.abs(height)) < 0.2 and np.nanmax(np.abs(field - 1)) < 0.2
     assert np.isnan(height[0, 0])
 
 
-@pytest.mark.parametrize(("left_out", "follows"), [(16, True), (6, False)])
-def test_a_flux_at_the_rim_that_no_phase_explains_is_left_to_the_cap(left_out, follows):
-    hits, labels = ions_of(8000, voltage=varying(8000))
+def test_a_flux_at_the_rim_that_no_phase_explains_is_that_of_the_crystal():
+    hits, _ = ions_of(8000)
     rim = np.hypot(hits.x, hits.y) > 100 * np.tan(0.82 * HALF)
-    kept = ~rim | (np.cumsum(rim) % left_out > 0)
-    found = evolving(hits[kept])
-    assert found.verdict.startswith("followed by" if follows else "cap: the flux at the rim is 0.88 of that of")
-    # with a phase it is that of the phase, too
-    assert evolving(hits[kept], labels=labels[kept]).history is not None
+    kept = ~rim | (np.cumsum(rim) % 6 > 0)  # 0.88 of the flux of the whole view
+    found, cap = evolving(hits[kept]), ae.reconstruct(hits[kept], radius=13.0, **KNOWN)
+    np.testing.assert_allclose(found.depths, cap.depths, atol=0.01)
+    # followed as where a phase is seen, the sphere would sink by 0.88 of it
+    by_rim = EvolvingSurface(found.sequence).integrate()
+    assert by_rim.apex_depths[-1] / found.depths[-1] == pytest.approx(0.88, abs=0.01)
+
+
+@pytest.mark.parametrize(("left_out", "way"), [(16, "ring"), (6, "surface")])
+def test_with_a_phase_inside_the_rim_is_followed_if_the_matrix_is_even_there(left_out, way):
+    hits, _ = ions_of(8000, voltage=varying(8000))
+    rim = np.hypot(hits.x, hits.y) > 100 * np.tan(0.82 * HALF)
+    hits = hits[~rim | (np.cumsum(rim) % left_out > 0)]
+    places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
+    ball = (np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 0.8).astype(int)
+    found = evolving(hits, labels=ball)
+    assert found.followed_by == way
+    assert ("the flux is that of the crystal, 0.88 of the view" in found.verdict) == (way == "surface")
+    # without a voltage nothing tells more than the volume
+    plain = evolving(replace(hits, voltage=None), labels=ball)
+    assert plain.followed_by == ("ring" if way == "ring" else "volume")
+    assert plain.verdict.endswith(", no voltage")
 
 
 def test_a_layer_of_the_same_field_is_found_to_have_it():
@@ -116,6 +135,11 @@ def test_solutes_without_a_contrast_change_nothing():
     assert "no solute has a contrast over its noise" in found.verdict
     assert abs(found.phases[0].contrast) < 3
     np.testing.assert_array_equal(found.positions, plain.positions)
+    # the voltage tells of the recession a second time
+    (change,), (same,) = (one.recession_changes() for one in (found, plain))
+    np.testing.assert_array_equal(change, same)
+    ions = plain.sequence
+    np.testing.assert_allclose(change, plain.again(ions, by="surface") - plain.again(ions), atol=0.02)
 
 
 def test_the_radius_grows_on_a_shank_and_follows_the_voltage_otherwise():
@@ -198,7 +222,7 @@ def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recess
     hits, _ = ions_of(voltage=varying())
     places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
     ball = np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 1.5
-    found, plain = evolving(hits, labels=ball.astype(int)), evolving(replace(hits, voltage=None))
+    found, plain = (evolving(one, labels=ball.astype(int)) for one in (hits, replace(hits, voltage=None)))
     assert found.verdict == "followed by the flux at the rim: at most 0.00 of it is of a phase"
     np.testing.assert_array_equal(found.positions, plain.positions)
     (phase,) = found.phases

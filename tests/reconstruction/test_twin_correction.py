@@ -28,6 +28,13 @@ def patterned(n, rng, turn=0.0):
     return flux[rng.random(len(flux)) < density / 2]
 
 
+def two_grains(rng):
+    """Directions with this density, and with the opposite pattern in a sixth of the view."""
+    right, other = patterned(5000, rng), patterned(5000, rng, math.pi / 3)
+    across = 0.6 * math.sin(RIM)
+    return rng.permutation(np.concatenate([right[right[:, 0] < across], other[other[:, 0] > across]]))
+
+
 @pytest.fixture(scope="module")
 def twin():
     rng = np.random.default_rng(5)
@@ -58,13 +65,18 @@ def test_what_is_left_is_the_scatter_and_half_of_the_mean(twin):
 def test_the_gain_is_that_of_the_densities(twin):
     rng = np.random.default_rng(6)
     # half the variance of the density, 0.4^2 / 4, to first order; less what the Gaussian of 3 degrees takes
-    assert twin.gain(patterned(5000, rng)) == pytest.approx(0.4**2 / 8, abs=0.004)
-    assert twin.gain(even_flux(5000, RIM)) == pytest.approx(-(0.4**2) / 8, abs=0.004)
-    assert twin.gain(patterned(5000, rng, math.pi / 3)) < -0.04
+    whole, worst = twin.gains(patterned(5000, rng))
+    assert whole == pytest.approx(0.4**2 / 8, abs=0.004) and 0 < worst < whole
+    assert twin.gains(even_flux(5000, RIM))[0] == pytest.approx(-(0.4**2) / 8, abs=0.004)
+    assert max(twin.gains(patterned(5000, rng, math.pi / 3))) < -0.04
+    # the opposite pattern in a sixth of the view
+    whole, worst = twin.gains(two_grains(rng))
+    assert whole > 0.003 and worst < -0.005  # 0.001 to 0.008 and -0.017 to -0.009 along four directions
 
 
 def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
-    monkeypatch.setattr(TwinErrors, "of", lambda run, rim: twin)
+    ways = []
+    monkeypatch.setattr(TwinErrors, "of", lambda run, rim, way="ring": ways.append(way) or twin)
     run = object.__new__(ae.Run)
     known = {
         "atomic_volume": 0.0166, "efficiency": 0.5, "distance": 100.0, "radius": 40.0, "projection": "compressed",
@@ -72,14 +84,20 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     }  # fmt: skip
 
     def evolving(directions, **more):
-        hits = ae.Hits(x=100 * directions[:, 0] / directions[:, 2], y=100 * directions[:, 1] / directions[:, 2])
-        return ae.reconstruct(hits, shape="evolving", **known, **more)
+        elements = np.where(np.random.default_rng(3).random(len(directions)) < 0.05, "Mg", "Al")
+        x, y = (100 * directions[:, side] / directions[:, 2] for side in (0, 1))
+        return ae.reconstruct(ae.Hits(x=x, y=y, extra={"element": elements}), shape="evolving", **known, **more)
 
     directions = patterned(5000, np.random.default_rng(6))
     plain, found = evolving(directions), evolving(directions, twin=run)
+    assert ways == [found.followed_by] == ["volume"]
+    # of a solute without a contrast this is not known before
+    assert "no solute has a contrast" in evolving(directions, twin=run, solutes=("Mg",)).verdict
+    assert ways[1:] == ["ring", "volume"]
     # exp(0.019): the gain of the test above
     assert found.verdict == plain.verdict + (
-        "; the twin is used: by its density the ions are 1.019 times as likely as by an even one"
+        "; the twin is used: by its density the ions are 1.019 times as likely as by an even one, 1.015 times in the "
+        "worst half of the view"
     )
     shifts = twin.shifts_at(directions, np.full(len(directions), 40.0))
     np.testing.assert_allclose(found.specimen_positions - plain.specimen_positions, shifts, atol=1e-12)
@@ -97,11 +115,12 @@ def test_positions_are_corrected_or_the_verdict_refuses(twin, monkeypatch):
     assert "; the twin is not used: by its density the ions are 0.9" in refused.verdict
     assert refused.twin_errors is None
     np.testing.assert_array_equal(refused.positions, plain.positions)
+    assert "; the twin is not used" in evolving(two_grains(np.random.default_rng(6)), twin=run).verdict
     # the cap in place of the surface: nothing to correct
     few = evolving(flat[:50], twin=run)
     assert few.verdict == "cap: 50 ions, fewer than 2,000"
 
-    def refuse(run, rim):
+    def refuse(run, rim, way):
         raise ValueError("twin must be another one")
 
     # before the passes, which take seconds
