@@ -365,6 +365,7 @@ class _Named:
         contents, ions = explanation.contents, explanation.ions
         self.calibration, self.background = explanation.calibration, contents.background
         self.profiles = IonProfiles(peaks, contents, fit.shares[chosen], explanation.amplitudes)
+        self._counted = explanation.numbers.profiles(explanation.chosen)
         errors = np.sqrt(np.maximum(np.diag(explanation.covariance), 0)).tolist() if len(ions) else []
         intervals = self.profiles.intervals()
         named = [
@@ -400,7 +401,7 @@ class _Named:
 
     def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
         """Numbers of ions and their covariance among some ions [Da]."""
-        return self.profiles.amounts(mass)
+        return self._counted.amounts(mass)
 
     def losses(self, single: Floats, multiple: Floats, before: Composition) -> DeadTimeLoss:
         """Losses among the ions of pulses with several [Da], from those of pulses with one."""

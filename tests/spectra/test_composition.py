@@ -135,8 +135,8 @@ def test_a_molecule_is_not_twice_itself_with_two_charges():
     assert names == {ion_name(*ion) for ion in ions}
 
 
-def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
-    """At 184 Da isotopes are three, or two, standard deviations apart: W+ or "WH+, or W+" as it is; W+, L1 1.2."""
+def test_a_hydride_in_one_broad_peak_with_its_metal_is_told_by_the_tails_of_others():
+    """At 184 Da isotopes are three, or two, standard deviations apart: W+, or WH+ and W+; L1 0.2, 0.3 and 0.5."""
     ions = {("W", 2): 40, ("W", 1): 16, ("Y", 1): 40, ("Y", 2): 16, ("Pt", 2): 4, ("Cr", 2): 4, ("Cr", 1): 1.6}
     ions |= {("Mg", 1): 4, ("H", 1): 8}
     for hydride in ({}, {("WH", 1): 8}):
@@ -145,19 +145,32 @@ def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
         result = ae.spectrum(hits, list(expected))
         assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions | hydride}
         assert distance(result.composition, expected) < 0.6
-        for ion in result.ions if hydride else ():
-            assert ion.others == (("W⁺",) if ion.name == "WH⁺" else ())
-    assert result.composition.error["H"] > 2  # 10.9, or 5.7 without it
+        assert not any(ion.others for ion in result.ions)
+        assert abs(result.composition["H"] - expected["H"]) < 2 * result.composition.error["H"] < 3
     result = ae.spectrum(made(ions, 300_000, width=1.8e-3, tail=6e-3, error=(6e-4, -1e-3)), list(expected))
     assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
     assert distance(result.composition, truth(ions)) < 2
 
 
-def test_a_hydride_five_standard_deviations_from_its_metal_may_be_its_isotopes():
-    ions = {("W", 3): 40, ("WH", 3): 12, ("Cr", 2): 3, ("Fe", 2): 10, ("H", 1): 2}
-    result = ae.spectrum(made(ions, width=1e-3, tail=3e-3), list(truth(ions)))
-    (hydride,) = (ion for ion in result.ions if ion.name == "WH³⁺")
-    assert "W³⁺" in hydride.others and result.composition.error["H"] > 2
+@pytest.mark.parametrize("others", [{("Cr", 2): 3, ("Fe", 2): 10}, {}], ids=["taught", "alone"])
+@pytest.mark.parametrize(("part", "number", "width"), [(0, 300_000, 1.2e-3), (0.025, 300_000, 1.2e-3),
+                                                     (0.3, 60_000, 1e-3), (0.3, 300_000, 1e-3)])  # fmt: skip
+def test_a_hydride_in_the_tails_of_its_metal_is_found_or_in_the_error(others, part, number, width):
+    """WH3+ three to five standard deviations from W3+, taught by the tails of others, or by none.
+
+    30 % of it was lost, with H 3.0 ± 0.03 at.% for 17.7.
+    """
+    ions = {("W", 3): 40, ("H", 1): 2} | others | ({("WH", 3): 40 * part} if part else {})
+    hits, expected = made(ions, number, seed=2, width=width, tail=3.3 * width), truth(ions)
+    result = ae.spectrum(hits, list(expected))
+    value, error = result.composition["H"], result.composition.error["H"]
+    assert abs(value - expected["H"]) < 2 * error
+    if part == 0.3:  # 17.8 ± 0.5, 18.4 ± 0.4, 21.5 ± 0.6 and 21.9 ± 0.5 of 17.7 and 21.2
+        assert error < 1 and "WH³⁺" in {ion.name for ion in result.ions}
+    else:  # 3.7 ± 0.5 of 3.6, 3.6 ± 2.3 of 5.3, 4.8 ± 3.3 of 4.8 and 4.7 ± 3.9 of 6.8
+        assert error > (1 if part else 0.3) and "WH³⁺" not in {ion.name for ion in result.ions}
+    region = result.composition_of(np.ones(len(hits), bool))
+    assert region["H"] == pytest.approx(value, rel=1e-3)
 
 
 @pytest.mark.parametrize("number", [1500, 12_000])
