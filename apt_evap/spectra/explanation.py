@@ -28,9 +28,9 @@ _FLANK = 14.0  # standard deviations of 1 Da over the charge, below which a hydr
 _BEFORE, _BEHIND = 4.0, 8.0  # of an ion, within which another one may be in its flanks
 _HYDRIDE = 8.0  # cost of such a hydride in the error
 _PRIOR = 0.25
-"""Part of the costs of other names that counts against them in the error. Two cases chose it: with 0.5, SbH2+ is no
-longer W3+ (see the tests); with 0, hydrogen would be as likely deuterium. Coverage does not: of 117 and 118 shares of
-few and of broad ions (seed 404102, all elements tried) 91 and 92 % are within 1.96 errors with 0, 0.25, 0.5 and 1."""
+"""Part of the costs of other names that counts against them in the error. It is a convention: the costs are, too, and
+coverage does not decide: of 117 and 118 shares of few and of broad ions (seed 404102, all elements tried) 91 and 92 %
+are within 1.96 errors with 0, 0.25, 0.5 and 1. With 0, hydrogen would be as likely deuterium."""
 _LEAST_GAIN = 1.0  # of chi-squared, of an ion in the peaks of others: a standard error
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60

@@ -296,6 +296,39 @@ def test_the_composition_of_a_region_is_its_own():
         result.composition_of([True])
 
 
+def test_ions_in_no_peak_have_no_composition():
+    """The background between the peaks; and gold that is not among the elements, alone and with as much aluminium."""
+    hits = made({("Al", 1): 90, ("Au", 1): 5})
+    result, mass = ae.spectrum(hits, "Al"), hits.mass_to_charge
+    between, gold = (mass > 30) & (mass < 190), (mass > 196) & (mass < 199)
+    beside = result.composition_of(between)
+    assert beside.at_percent == {} and f"the {between.sum():,} ions are in no peak of an ion with a name" in str(beside)
+    lone = result.composition_of(gold)
+    assert lone.at_percent == {} and lone.unexplained > 0.98
+    assert result.composition_of(mass < 30).unexplained < 0.001
+    few = result.composition_of((mass < 30) & (np.arange(len(mass)) < 10))
+    assert few.at_percent == {"Al": 100} and few.unexplained < 0.01
+    mixed = result.composition_of(gold | ((mass > 26) & (mass < 28) & (np.arange(len(mass)) < 3500)))
+    aluminium = np.count_nonzero((mass > 26) & (mass < 28) & (np.arange(len(mass)) < 3500))
+    assert mixed.unexplained == pytest.approx(gold.sum() / (gold.sum() + aluminium), abs=0.02)
+    every = result.composition_of(hits).unexplained
+    assert every == pytest.approx(result.unexplained_part, abs=0.002)
+    ranged = ae.spectrum(hits, ranges=ae.spectra.Ranges(("Al",), [26.0], [28.0], composition=({"Al": 1},)))
+    assert ranged.composition_of(between).at_percent == {}
+
+
+def test_ions_without_a_mass_are_counted_and_said():
+    hits = made({("Al", 1): 90, ("Mg", 2): 10}, 5000)
+    mass = hits.mass_to_charge.copy()
+    mass[:12] = np.nan
+    result = ae.spectrum(ae.Hits(mass_to_charge=mass))
+    assert result.composition.without_mass == result.composition.plain()["ions_without_mass"] == 12
+    assert f"12 of {len(mass):,} ions have no mass-to-charge ratio: they are not counted" in str(result).splitlines()
+    assert result.composition_of(np.arange(len(mass)) < 500).without_mass == 12
+    assert "ions_without_mass" not in ae.spectrum(hits).composition.plain()
+    assert "no mass-to-charge" not in str(ae.spectrum(hits))
+
+
 def test_errors_follow_from_counting():
     """Ions of two elements: the error of the share p of n ions is that of a binomial, sqrt(p (1 - p) / n)."""
     composition = Amounts([{"A": 1}, {"B": 1}], np.array([300.0, 100.0]), np.diag([300.0, 100.0])).composition(0.0)
