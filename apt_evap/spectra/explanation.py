@@ -479,7 +479,6 @@ class Explainer:
             number = int(choice.numbers([other])[0])
             kept = [at for at in kept if at != number]
             kept += [number] if flank.sure else []
-        numbers.base = kept
         return kept
 
     def _groups(self, choice, kept):
@@ -528,10 +527,9 @@ class Explainer:
             if number not in kept:
                 found = numbers.with_flank(explanation.amplitudes, explanation.covariance, kept, flank)
                 explanation.sets.append(([*kept, number], *found, _PRIOR * _HYDRIDE - flank.gain))
-                continue
-            rest, worse = [at for at in kept if at != number], flank.gain - _PRIOR * _HYDRIDE
-            explanation.sets.append((rest, *numbers.amounts(rest), worse))
-            if worse < _ALIKE:
+            elif flank.gain < _ALIKE:
+                rest = [at for at in kept if at != number]
+                explanation.sets.append((rest, *numbers.amounts(rest), flank.gain - _PRIOR * _HYDRIDE))
                 explanation.others[kept.index(number)].insert(0, main)
 
     def _add_alternatives(self, choice, explanation, amplitudes, value):

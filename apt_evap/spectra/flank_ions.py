@@ -62,12 +62,8 @@ class Flank:
         By how much chi-squared is better with it.
     sure : bool
         Whether this is more than its cost.
-    best, alone : Lines
-        Peaks of `main` with the ions in its flanks that are sure, and without this one.
-    lines : Lines
-        Peaks of `other`.
-    company : dict of Ion to Lines
-        Peaks of other ions among these.
+    main_lines, lines : Lines
+        Peaks of the two.
     """
 
     main: Ion
@@ -76,10 +72,8 @@ class Flank:
     error: float
     gain: float
     sure: bool
-    best: Lines
-    alone: Lines
+    main_lines: Lines
     lines: Lines
-    company: dict[Ion, Lines]
 
 
 class FlankFit:
@@ -128,8 +122,8 @@ class FlankFit:
         self._owner = np.argmax(parts, axis=0) if len(parts) else np.zeros(len(contents.mass), int)
         self._named = parts.sum(0) > 0.5 * contents.ions
 
-    def fit(self, main: Ion, costs: Mapping[Ion, float]) -> tuple[list[Flank], Floats]:
-        """Ions in the flanks of one, of those that may be there with their costs, and the covariance of all there."""
+    def fit(self, main: Ion, costs: Mapping[Ion, float]) -> tuple[list[Flank], list[Ion], Floats]:
+        """Ions in the flanks of one, of those that have costs; all ions there, and their covariance."""
         scale = self.peaks.scale
         lines = [self._lines(ion) for ion in (main, *costs)]
         place = float(lines[0][0][int(np.argmax(lines[0][1]))])
@@ -137,7 +131,7 @@ class FlankFit:
         below, above = (_BACK / 2, _FRONT) if scale.mirrored else (_FRONT, _BACK / 2)
         low, high = max(int(ends.min() - below * BINS), 0), min(int(ends.max() + above * BINS), scale.size)
         if high - low < BINS:
-            return [], np.zeros((0, 0))
+            return [], [], np.zeros((0, 0))
         inside = (self._places >= low) & (self._places < high)
         company = [
             ion for ion, peak in zip(self.ions, self._main, strict=True) if inside[peak] and ion not in (main, *costs)
@@ -154,7 +148,8 @@ class FlankFit:
         fits = _Group(
             self.peaks, self.bases, lines, weights, (low, high), columns, np.array([*sure, *errors, shift]), size
         )
-        return fits.flanks(main, costs, {ion: self.amplitudes[self.ions.index(ion)] / size for ion in company})
+        found, covariance = fits.flanks(main, costs, [self.amplitudes[self.ions.index(ion)] / size for ion in company])
+        return found, list(group), covariance
 
     def _own_tails(self, lines, company, main, window, rest, weights):
         """Parts of the tails by the ions themselves, where no other peaks teach them."""
@@ -269,7 +264,7 @@ class _Group:
     def flanks(self, main, costs, company):
         """Those of `main`, by fits with and without each, beside a company of other ions."""
         self._tried = tried = len(costs) + 1
-        self._start[tried : self.number] = [*company.values()]
+        self._start[tried : self.number] = company
         every = frozenset(range(1, tried))
         p, best, expected, hessian = self._best(every)
         clear = expected > 1
@@ -285,13 +280,10 @@ class _Group:
         shape = self._shape(self._best(sure)[0][-4:])
         found = []
         for at, other in enumerate(costs, 1):
-            alone = self._shape(self._best(sure - {at})[0][-4:])
-            lines = Lines(*self.lines[0], shape), Lines(*self.lines[0], alone), Lines(*self.lines[at], shape)
             ions = float((self._best(sure)[0] if at in sure else p)[at]) * self.size
-            others = {ion: Lines(*self.lines[row], shape) for row, ion in enumerate(company, tried)}
-            found.append(
-                Flank(main, other, ions, float(error[at - 1]), float(gain[at - 1]), at in sure, *lines, others)
-            )
+            lines = Lines(*self.lines[0], shape), Lines(*self.lines[at], shape)
+            numbers = ions, float(error[at - 1]), float(gain[at - 1])
+            found.append(Flank(main, other, *numbers, at in sure, *lines))
         return found, self._covariance(sure, misfit, more)
 
     def _covariance(self, there, misfit, more):

@@ -33,14 +33,11 @@ class IonNumbers:
     ----------
     flanks : dict of Ion to Flank
         By the ion in the flank.
-    base : list of int
-        The ions that are named; other sets have some of these, or others in their place.
     """
 
     def __init__(self, peaks: PeakContents, fit: IonFit, abundances: Abundances, calibration: MassCalibration) -> None:
         self._peaks, self._fit, self._abundances, self._calibration = peaks, fit, abundances, calibration
         self.flanks: dict[Ion, Flank] = {}
-        self.base: list[int] = []
         self._groups: list[tuple[list[Ion], Floats]] = []
 
     def learn(self, chosen: Sequence[int], groups: Mapping[Ion, Mapping[Ion, float]]) -> None:
@@ -51,27 +48,22 @@ class IonNumbers:
             self._fit.shares[np.asarray(chosen, int)], self._fit.solve(chosen)[0],
         )  # fmt: skip
         for main, costs in groups.items():
-            flanks, covariance = fits.fit(main, costs)
+            flanks, group, covariance = fits.fit(main, costs)
             self.flanks |= {flank.other: flank for flank in flanks}
-            if flanks:
-                self._groups.append(([main, *costs, *flanks[0].company], covariance))
+            self._groups.append((group, covariance))
 
     def profiles(self, chosen: Sequence[int]) -> IonProfiles:
         """Spectra of some ions: lines that flanks know have places and shapes of their own."""
         ions = [self._fit.ions[number] for number in chosen]
-        start, lines, company = self._fit.solve(chosen)[0], {}, {}
+        start, lines = self._fit.solve(chosen)[0], {}
         for other, flank in self.flanks.items():
             if flank.main not in ions:
                 continue
-            company |= {ions.index(ion): own for ion, own in flank.company.items() if ion in ions and flank.sure}
-            at = ions.index(flank.main)
-            if flank.sure and other not in ions and set(chosen) <= set(self.base):
-                lines[at] = flank.alone
-            lines.setdefault(at, flank.best)
+            lines[ions.index(flank.main)] = flank.main_lines
             if other in ions:
                 lines[ions.index(other)] = flank.lines
                 start[ions.index(other)] = max(flank.ions, 1.0)
-        return self._profiles(chosen, start, company | lines)
+        return self._profiles(chosen, start, lines)
 
     def _profiles(self, chosen, start, lines):
         """Spectra of some ions, of which a few have lines of their own."""

@@ -173,6 +173,20 @@ def test_a_hydride_in_the_tails_of_its_metal_is_found_or_in_the_error(others, pa
     assert region["H"] == pytest.approx(value, rel=1e-3)
 
 
+def test_an_ion_in_both_flanks_of_another_is_not_its_tail():
+    """Re2+ on both sides of Nb+ and Nb+ in W2+: L1 0.6 and 0.4, and 10.1 and 3.5 as tails; U3+ is in the error."""
+    light = {("Mg", 2): 10, ("Mg", 1): 4, ("H", 1): 2}
+    rhenium = light | {("Nb", 1): 40, ("Nb", 2): 0.8, ("Re", 2): 3, ("Re", 1): 0.1}
+    niobium = light | {("W", 2): 40, ("W", 1): 2, ("Nb", 1): 1, ("Nb", 2): 0.02}
+    uranium = {("Gd", 2): 40, ("Gd", 1): 2, ("U", 3): 0.5, ("U", 2): 0.05, ("Fe", 2): 10, ("Fe", 1): 4, ("H", 1): 2}
+    for ions, most in ((rhenium, 1.5), (niobium, 1.0), (uranium, 3.0)):
+        hits, expected = made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3), truth(ions)
+        composition = ae.spectrum(hits, list(expected)).composition
+        assert distance(composition, expected) < most
+        for element, value in expected.items():
+            assert abs(composition[element] - value) < 2 * composition.error[element]
+
+
 @pytest.mark.parametrize("number", [1500, 12_000])
 def test_broad_peaks_of_hydrogen_are_counted(rng, number):
     """Four times as broad as the others, with a tail to low masses; 40 and 44 % of the ions with the common width."""
