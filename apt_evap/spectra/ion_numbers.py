@@ -52,6 +52,11 @@ class IonNumbers:
             self.flanks |= {flank.other: flank for flank in flanks}
             self._groups.append((group, covariance))
 
+    @property
+    def named_in_flanks(self) -> set[Ion]:
+        """Ions with a name in flanks of others, and these."""
+        return {ion for flank in self.flanks.values() if flank.sure for ion in (flank.main, flank.other)}
+
     def profiles(self, chosen: Sequence[int]) -> IonProfiles:
         """Spectra of some ions: lines that flanks know have places and shapes of their own."""
         ions = [self._fit.ions[number] for number in chosen]

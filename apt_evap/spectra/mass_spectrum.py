@@ -397,6 +397,9 @@ class _Named:
         )
         model = fit.explained(explanation.chosen, explanation.amplitudes)
         rest = contents.ions - model  # below zero where the ions should have more
+        mine = fit.shares[chosen[[ion in explanation.numbers.named_in_flanks for ion in ions]]].sum(0) > 0
+        if mine.any():  # the tails by which the contents are known are not those of the ions
+            rest[mine] = self._counted.left_over(explanation.amplitudes, contents.mass)[mine]
         large = np.abs(rest) > np.maximum(_UNLIKE * np.maximum(contents.ions, model), _FEWEST)
         large &= (np.abs(rest) > _CLEAR * np.sqrt(contents.variance)) & (contents.seen | (rest < 0))
         self.unexplained = tuple(
