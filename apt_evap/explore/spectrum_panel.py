@@ -417,15 +417,10 @@ def _composition_table(composition: Composition) -> str:
     """Elements with at.%, errors and the span over other names, as HTML."""
     if composition.refused:
         return f"<b>no composition</b><br>{escape(composition.refused)}"
-    rows = []
-    for element in [*composition.at_percent, *composition.perhaps]:
-        value = composition.at_percent.get(element)
-        name, number = (f"perhaps {element}", "0") if value is None else (element, f"{value:.2f}")
-        low, high = composition.span[element]
-        span = f"<small>{low:.2f} to {high:.2f}</small>" if high - low > max(composition.error[element], 0.005) else ""
-        rows.append(
-            f"<tr><td><b>{escape(name)}</b></td><td style='text-align: right'>{number}</td>"
-            f"<td>± {composition.error[element]:.2f}</td><td>{span}</td></tr>"
-        )
+    rows = [
+        f"<tr><td><b>{escape(name)}</b></td><td style='text-align: right'>{value or 0}</td>"
+        f"<td>± {error}</td><td>{f'<small>{span}</small>' if span else ''}</td></tr>"
+        for name, value, error, span in composition.rows()
+    ]
     head = "<tr><td colspan=4><b>composition [at.%]</b></td></tr>"
     return f"<table style='white-space: nowrap'>{head}{''.join(rows)}</table>"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats, Integers
-from apt_evap._common.validation import check_array, check_choice, check_count, check_kind, short_text
+from apt_evap._common.validation import check_array, check_choice, check_count, check_kind, did_you_mean, short_text
 from apt_evap.detection.binning import MAX_BINS, count
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits, MassRanges
@@ -325,7 +325,7 @@ def ion_charges(hits: Hits, element: str, ranges: MassRanges | None = None) -> I
         Ions of one element of a run in real units, with the column "charge_state" in `extra`; of an alloy, such as
         ``hits[run.species == 0]``. Or ions with mass_to_charge, for `ranges`.
     element : str
-        Chemical symbol; one of `ISOTOPES` for ranges.
+        Chemical symbol, one of `ISOTOPES`.
     ranges : Ranges, optional
         Ranges of the mass-to-charge ratio.
 
@@ -336,6 +336,9 @@ def ion_charges(hits: Hits, element: str, ranges: MassRanges | None = None) -> I
     """
     check_kind(hits, "hits", Hits, "Hits")
     check_kind(element, "element", str, "a chemical symbol such as 'Ni'")
+    if element not in ISOTOPES:
+        hint = did_you_mean(element, ISOTOPES)
+        raise ValueError(f"element must be a chemical symbol such as 'Ni', got {short_text(element)}{hint}")
     if ranges is not None:
         return check_kind(ranges, "ranges", "charges", "Ranges").charges(hits, element)
     if "charge_state" not in hits.extra:
@@ -344,7 +347,7 @@ def ion_charges(hits: Hits, element: str, ranges: MassRanges | None = None) -> I
             "the hits of run.at_evaporation_field(flight_charges=PostIonisation(...))"
         )
     charges = check_array(hits.extra["charge_state"], "charge_state", (len(hits),), dtype=np.int64)
-    if element in ISOTOPES and hits.mass_to_charge is not None:
+    if hits.mass_to_charge is not None:
         _check_masses(hits.mass_to_charge * charges, element)
     return charges
 

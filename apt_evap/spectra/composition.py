@@ -36,6 +36,8 @@ class Composition:
         Part of the ions in peaks that no ion explains.
     refused : str
         Why there is no composition; "" if there is one.
+    without_mass : int
+        Number of detected ions without m/n, which are not counted.
     """
 
     at_percent: dict[str, float]
@@ -43,6 +45,7 @@ class Composition:
     span: dict[str, tuple[float, float]]
     unexplained: float
     refused: str = ""
+    without_mass: int = 0
 
     def __getitem__(self, element: str) -> float:
         return self.at_percent[element]
@@ -51,14 +54,25 @@ class Composition:
         lines = [f"unexplained: {self.unexplained:.1%} of the ions in peaks"]
         if self.refused:
             return "\n".join([*lines, f"no composition: {self.refused}"])
-        for element, value in self.at_percent.items():
-            low, high = self.span[element]
-            error = self.error[element]
-            other = f" ({low:.2f} to {high:.2f} with other names)" if high - low > max(error, 0.005) else ""
-            lines.append(f"{element}: {value:.2f} ± {error:.2f} at.%{other}")
+        for name, value, error, span in self.rows():
+            if value:
+                lines.append(f"{name}: {value} ± {error} at.%" + (f" ({span} with other names)" if span else ""))
         for element, high in self.perhaps.items():
             lines.append(f"perhaps {element}: 0 to {high:.2f} at.% with other names, ± {self.error[element]:.2f}")
         return "\n".join(lines)
+
+    def rows(self) -> list[tuple[str, str, str, str]]:
+        """Rows of a table: element, at.%, error, and the span over other names.
+
+        The value is "" for an element that only other names have, and the span where it is not more than the error.
+        """
+        rows = []
+        for element in [*self.at_percent, *self.perhaps]:
+            value, error, (low, high) = self.at_percent.get(element), self.error[element], self.span[element]
+            span = f"{low:.2f} to {high:.2f}" if high - low > max(error, 0.005) else ""
+            name, number = (f"perhaps {element}", "") if value is None else (element, f"{value:.2f}")
+            rows.append((name, number, f"{error:.2f}", span))
+        return rows
 
     @property
     def perhaps(self) -> dict[str, float]:
@@ -72,6 +86,8 @@ class Composition:
         more: dict[str, object] = {"refused": self.refused} if self.refused else {}
         if self.perhaps:
             more["perhaps"] = {e: {"highest": high, "error": self.error[e]} for e, high in self.perhaps.items()}
+        if self.without_mass:
+            more["ions_without_mass"] = self.without_mass
         return {"composition": shares, "unexplained": self.unexplained, **more}
 
 
@@ -97,7 +113,7 @@ class Amounts:
     covariance: Floats
     others: Sequence[tuple[Sequence[Mapping[str, int]], Floats, Floats, float]] = field(default=())
 
-    def composition(self, unexplained: float, refused: str = "") -> Composition:
+    def composition(self, unexplained: float, refused: str = "", without_mass: int = 0) -> Composition:
         """Composition of these ions; none where too much is unexplained."""
         if not refused and unexplained > MOST_UNEXPLAINED:
             refused = f"{unexplained:.1%} of the ions in peaks are unexplained, more than {MOST_UNEXPLAINED:.0%}"
@@ -105,7 +121,7 @@ class Amounts:
         if not refused and not share:
             refused = "no ion has a name"
         if refused:
-            return Composition({}, {}, {}, unexplained, refused)
+            return Composition({}, {}, {}, unexplained, refused, without_mass)
         span = {element: [value, value] for element, value in share.items()}
         weights, spread = dict.fromkeys(share, 1.0), dict.fromkeys(share, 0.0)
         for *other, worse in self.others:
@@ -132,6 +148,7 @@ class Amounts:
             {element: errors[element] for element in every},
             {element: (span[element][0], span[element][1]) for element in every},
             unexplained,
+            without_mass=without_mass,
         )
 
 

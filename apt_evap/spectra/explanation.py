@@ -13,26 +13,24 @@ from apt_evap.spectra.candidate_ions import atomic_ions, ions_between
 from apt_evap.spectra.ion_choice import IonChoice
 from apt_evap.spectra.ion_fit import MISSED, IonFit
 from apt_evap.spectra.ion_names import COMMON, GASES, Abundances, Ion, atoms_of_formula, element_of
-from apt_evap.spectra.ion_profiles import IonProfiles
+from apt_evap.spectra.ion_numbers import IonNumbers
 from apt_evap.spectra.mass_calibration import MassCalibration
 from apt_evap.spectra.peak_contents import Contents, PeakContents
 from apt_evap.spectra.peak_scale import HIGHEST, LIGHT, LOWEST
 
 _SHAPE = 0.02  # relative error of a content while ions are chosen: the shape of a peak
-_FINAL_SHAPE = 0.003  # relative error of the number of an ion by the shape of its peaks
 _WINDOWS = (0.005, 0.005, 0.004, 0.004)  # relative distance of peaks from their ions, in each round
 _MOST_IONS = (14, 24, 60, 60)
 _OWN_SHIFT = 5e-4  # of the peaks of an ion of its own, once the others have names
 _ALIKE = 30.0
 """Chi-squared and costs by which another name of a peak may be worse: then both are named."""
-_ONE_PEAK = 6.0
-"""Standard deviations of 1 Da over the charge, below which a hydride may be the isotopes of its metal, in the error.
-With 4, an invented WH3+ left H at 17.5 +- 0.3 at.% for 4.9. Shares outside two errors, of 25 broad specimens with
-hydrides: 37 of 116 with 4, 35 with 5, 30 with 6 (seed 404104, which chose it); 23, 23 and 22 of 107 (404105)."""
+_FLANK = 14.0  # standard deviations of 1 Da over the charge, below which a hydride may be the tail of its metal
+_BEFORE, _BEHIND = 4.0, 8.0  # of an ion, within which another one may be in its flanks
+_HYDRIDE = 8.0  # cost of such a hydride in the error
 _PRIOR = 0.25
-"""Part of the costs of other names that counts against them in the error. Two cases chose it: with 0.5, SbH2+ is no
-longer W3+ (see the tests); with 0, hydrogen would be as likely deuterium. Coverage does not: of 117 and 118 shares of
-few and of broad ions (seed 404102, all elements tried) 91 and 92 % are within 1.96 errors with 0, 0.25, 0.5 and 1."""
+"""Part of the costs of other names that counts against them in the error. It is a convention: the costs are, too, and
+coverage does not decide: of 117 and 118 shares of few and of broad ions (seed 404102, all elements tried) 91 and 92 %
+are within 1.96 errors with 0, 0.25, 0.5 and 1. With 0, hydrogen would be as likely deuterium."""
 _LEAST_GAIN = 1.0  # of chi-squared, of an ion in the peaks of others: a standard error
 _POINT_ERROR = 1e-4  # least error of a point of the calibration
 _MOST_POINTS = 60
@@ -58,6 +56,8 @@ class Explanation:
     covariance: Floats
     others: list[list[int]]
     """Ions that could be in place of each."""
+    numbers: IonNumbers
+    """Their numbers."""
     sets: list[tuple[list[int], Floats, Floats, float]] = field(default_factory=list)
     """Other sets of ions that explain the peaks about as well, their amplitudes with covariance, and by how much
     chi-squared and a part of their costs are above."""
@@ -104,7 +104,8 @@ class Explainer:
         if self.allowed is not None and not self.allowed:  # nothing is left to name
             fit = IonFit(contents, self.peaks.scale, self.calibration, self.abundances, _SHAPE, _WINDOWS[-1])
             none = np.zeros(0)
-            return Explanation(contents, self.calibration, fit, [], none, np.zeros((0, 0)), [])
+            numbers = IonNumbers(self.peaks, fit, self.abundances, self.calibration)
+            return Explanation(contents, self.calibration, fit, [], none, np.zeros((0, 0)), [], numbers)
         choice = self._choice(contents, _WINDOWS[0])
         ions = atomic_ions(choice.elements)
         self._anchors = find_anchors(contents, self.peaks.scale, self.abundances, ions)
@@ -454,20 +455,82 @@ class Explainer:
         choice.learn_shares(chosen, amplitudes)
         chosen, amplitudes, value = choice.pruned(chosen, amplitudes, chi2 + choice.cost(chosen))
         kept = [number for number, x in zip(chosen, amplitudes, strict=True) if x > 0]
-        amplitudes = amplitudes[amplitudes > 0]
-        fit = choice.fit
-        final, covariance = self.amounts(fit, kept)
+        numbers = IonNumbers(self.peaks, choice.fit, self.abundances, self.calibration)
+        kept = self._with_flanks(choice, kept, numbers)
+        amplitudes, chi2 = choice.fit.solve(kept)
+        value = chi2 + choice.cost(kept)
         explanation = Explanation(
-            contents, self.calibration, fit, kept, final, covariance, [], [], either, perhaps
+            contents, self.calibration, choice.fit, kept, *numbers.amounts(kept), [], numbers, [], either, perhaps
         )  # fmt: skip
         self._add_alternatives(choice, explanation, amplitudes, value)
+        self._add_flanks(choice, explanation)
         more = self._with_perhaps(choice, kept, amplitudes, perhaps)
         self._add_sets(choice, explanation, [[*kept, *numbers] for numbers in more], value)
         self._add_hidden(choice, explanation, hidden | self._hidden(choice, kept, amplitudes))
         for others, worse in sets:
-            numbers = choice.numbers(others).tolist()
-            explanation.sets.append((numbers, *self.amounts(fit, numbers), worse))
+            names = choice.numbers(others).tolist()
+            explanation.sets.append((names, *numbers.amounts(names), worse))
         return explanation
+
+    def _with_flanks(self, choice, kept, numbers):
+        """The ions with those in flanks of others that are surely more than tails, and without the others there."""
+        numbers.learn(kept, self._groups(choice, kept))
+        for other, flank in numbers.flanks.items():
+            number = int(choice.numbers([other])[0])
+            kept = [at for at in kept if at != number]
+            kept += [number] if flank.sure else []
+        return kept
+
+    def _groups(self, choice, kept):
+        """Ions that may be in the flanks of each ion, with their costs: hydrides of a metal, and hidden atomic ions."""
+        fit = choice.fit
+        ions, groups = [fit.ions[number] for number in kept], defaultdict(dict)
+        mains = [float(fit.contents.mass[fit.main[number]]) for number in kept]
+        for ion, mass in zip(ions, mains, strict=True):
+            apart = math.log1p(1 / (ion.charge * mass)) / float(self.peaks.scale.sigma(mass))
+            metal = ion.formula in choice.elements and ion.formula not in (*GASES, "D")
+            if metal and apart < _FLANK and "H" in choice.elements and "H" not in choice.banned:
+                hydrides = [Ion(f"{ion.formula}{more}", ion.charge) for more in ("H", "H2")]
+                tried = [other for other in hydrides if other in ions or other is hydrides[0]]
+                groups[ion] |= {other: self._cost_of(choice, kept, other) for other in tried}
+        for other in self._hidden_atoms(choice, ions):
+            place = self._main_place(other)
+            distance = np.log(place / np.array(mains)) / self.peaks.scale.sigma(place)
+            near = np.flatnonzero((distance > -_BEFORE) & (distance < _BEHIND))
+            if len(near):
+                main = ions[near[int(np.argmax(fit.contents.ions[fit.main[np.array(kept)[near]]]))]]
+                groups[main][other] = self._cost_of(choice, kept, other)
+        return groups
+
+    def _main_place(self, ion):
+        """m/n of the most abundant isotope of an ion as it is measured [Da]."""
+        masses, shares = self.abundances.lines(ion.formula)
+        return float(self.calibration.place(masses[[int(np.argmax(shares))]] / ion.charge)[0])
+
+    def _hidden_atoms(self, choice, ions):
+        """Atomic ions without a name of the elements that are there or given."""
+        names = {name for ion in ions for name in ion.atoms} | (self.allowed or set())
+        tried = atomic_ions(sorted(names - choice.banned - {"H", "D"}))
+        return [ion for ion in tried if ion not in choice.banned_ions and ion not in ions]
+
+    def _cost_of(self, choice, kept, ion):
+        """Cost of an ion beside the others."""
+        number = int(choice.numbers([ion])[0])
+        rest = [at for at in kept if at != number]
+        return math.inf if ion in choice.banned_ions else choice.cost([*rest, number]) - choice.cost(rest)
+
+    def _add_flanks(self, choice, explanation):
+        """Sets without the hydrides in flanks that are named, and with the others."""
+        numbers, kept = explanation.numbers, explanation.chosen
+        for other, flank in numbers.flanks.items():
+            number, main = choice.numbers([other, flank.main]).tolist()
+            if number not in kept:
+                found = numbers.with_flank(explanation.amplitudes, explanation.covariance, kept, flank)
+                explanation.sets.append(([*kept, number], *found, _PRIOR * _HYDRIDE - flank.gain))
+            elif flank.gain < _ALIKE:
+                rest = [at for at in kept if at != number]
+                explanation.sets.append((rest, *numbers.amounts(rest), flank.gain - _PRIOR * _HYDRIDE))
+                explanation.others[kept.index(number)].insert(0, main)
 
     def _add_alternatives(self, choice, explanation, amplitudes, value):
         """Other names of the peaks, each ion in turn, and the sets of ions with them."""
@@ -480,17 +543,14 @@ class Explainer:
                     others.append((total, other))
                     sets.append([*rest, other])
             explanation.others.append([other for _, other in sorted(others)[:3]])
-            if choice.atoms[number].sum() > 1:  # its peaks may be isotopes of the others
+            if choice.atoms[number].sum() > 1 and fit.ions[number] not in explanation.numbers.flanks:
+                # its peaks may be isotopes of the others
                 sets.append([other for other in kept if other != number])
         for _, more, rest in choice.other_elements(kept, amplitudes, value + _ALIKE):
             sets.append([*rest, *more])
             for number, others in zip(kept, explanation.others, strict=True):
                 others += [other for other in more if fit.main[other] == fit.main[number] and other not in others]
         self._add_sets(choice, explanation, sets, value)
-        for number, bare in self._in_one_peak(fit, kept):
-            rest = [other for other in kept if other != number]
-            explanation.sets.append((rest, *self.amounts(fit, rest), 0.0))
-            explanation.others[kept.index(number)].insert(0, bare)
 
     def _add_sets(self, choice, explanation, sets, value):
         """Those of some sets of ions that are about as good as the ones with `value`."""
@@ -500,7 +560,7 @@ class Explainer:
             other, other_cost = fit.solve(numbers)[1], choice.cost(numbers)
             if other + other_cost < value + _ALIKE:
                 worse = other - chi2 + _PRIOR * (other_cost - cost)
-                explanation.sets.append((numbers, *self.amounts(fit, numbers), worse))
+                explanation.sets.append((numbers, *explanation.numbers.amounts(numbers), worse))
 
     def _hidden(self, choice, chosen, amplitudes):
         """Ions that may be in the peaks of others, by a standard error or more, and how much worse they are.
@@ -532,21 +592,10 @@ class Explainer:
 
     def _add_hidden(self, choice, explanation, hidden):
         """Sets with one more ion that may be in the peaks of others."""
-        fit, kept = choice.fit, explanation.chosen
+        kept = explanation.chosen
         for ion, worse in hidden.items():
-            if (number := int(choice.numbers([ion])[0])) not in kept:
-                explanation.sets.append(([*kept, number], *self._amounts_with(fit, kept, number), worse))
-
-    def _in_one_peak(self, fit, kept):
-        """Hydrides whose lines are in one broad peak with those of the ion without hydrogen, and these ions."""
-        for number in kept:
-            ion = fit.ions[number]
-            rest = {name: count for name, count in ion.atoms.items() if name != "H"}
-            bare = [n for n in kept if fit.ions[n].charge == ion.charge and fit.ions[n].atoms == rest]
-            if n := next(iter(bare if "H" in ion.atoms else ()), None):
-                mass = float(fit.contents.mass[fit.main[n]])
-                if math.log1p(1 / (ion.charge * mass)) < _ONE_PEAK * float(self.peaks.scale.sigma(mass)):
-                    yield number, n
+            if (number := int(choice.numbers([ion])[0])) not in kept and ion not in explanation.numbers.flanks:
+                explanation.sets.append(([*kept, number], *explanation.numbers.amounts_with(kept, number), worse))
 
     def _with_shifted(self, choice, chosen):
         """Further ions of known elements, whose peaks lie beside the smooth calibration."""
@@ -572,24 +621,3 @@ class Explainer:
             value, chosen, amplitudes = best
             value -= 20
         return chosen
-
-    def _amounts_with(self, fit, chosen, number):
-        """Ions of each of some ions and of one more, whose lines have the common shape at places of their own."""
-        masses, shares = self.abundances.lines(fit.ions[number].formula)
-        contents, new = fit.contents, self.calibration.place(masses / fit.ions[number].charge)
-        shapes = np.vstack([contents.shapes, np.tile(self.peaks.shape, (len(new), 1))])
-        contents = contents._replace(mass=np.append(contents.mass, new), shapes=shapes)
-        rows = np.pad(fit.shares[np.asarray(chosen, int)], ((0, 1), (0, len(new))))
-        rows[-1, -len(new) :] = shares
-        start = np.maximum(fit.solve([*chosen, number])[0], 1.0)
-        ions, covariance = IonProfiles(self.peaks, contents, rows, start).amounts_of_all()
-        return ions, covariance + np.diag((_FINAL_SHAPE * ions) ** 2)
-
-    def amounts(self, fit: IonFit, chosen: Sequence[int]) -> tuple[Floats, Floats]:
-        """Ions of each of some ions with their covariance, by the likelihood of the spectrum."""
-        if not len(chosen):
-            return np.zeros(0), np.zeros((0, 0))
-        shares = fit.shares[np.asarray(chosen, int)]
-        profiles = IonProfiles(self.peaks, fit.contents, shares, fit.solve(chosen)[0])
-        ions, covariance = profiles.amounts_of_all()
-        return ions, covariance + np.diag((_FINAL_SHAPE * ions) ** 2)

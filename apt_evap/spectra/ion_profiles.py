@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from apt_evap._common.types import Floats
-from apt_evap.spectra.peak_contents import Contents, PeakContents
+from apt_evap.spectra.peak_contents import CORE, Contents, PeakContents
 
 _OWN = 0.5  # part of a peak that an ion has, for a range there
 _FOOT = 0.003  # of the height of a peak, below which no range goes, whatever the background
@@ -64,6 +64,15 @@ class IonProfiles:
         expected = np.maximum(model @ numbers, 1e-9)
         information = (model.T @ model.multiply(1 / expected[:, None]).tocsr()).toarray()
         return numbers[:-1], np.linalg.pinv(information)[:-1, :-1]
+
+    def left_over(self, ions: Floats, peaks: Floats) -> Floats:
+        """Ions in the cores of peaks at some m/n [Da] that numbers of ions and the background do not explain."""
+        scale, shape, left = self.peaks.scale, self.peaks.shape, self.peaks.left
+        expected = self._columns @ (self.shares.T @ ions) + self.contents.background
+        rest = np.pad(np.cumsum(self.peaks.counts - expected), (1, 0))
+        middle = np.rint(scale.bins(peaks)).astype(int)
+        low, high = np.clip(middle - CORE, 0, scale.size), np.clip(middle + CORE + 1, 0, scale.size)
+        return (rest[high] - rest[low]) / float(shape[left - CORE : left + CORE + 1].sum())
 
     def intervals(self) -> list[list[tuple[float, float]]]:
         """Bounds of the peaks of each ion [Da]: as far as its ions are more than those of all others.

@@ -39,6 +39,7 @@ _FREQUENT = 0.1  # abundance over the largest of an isotope that makes a peak
 _CLEAN = 0.98  # part of a peak that one ion has, to measure its isotopes there
 _FEW_HEAVY = 1e-3  # part of the ions that is above the spectrum without a word
 _SHOWN = 8  # unexplained peaks in a text
+_CLEAR_OF_BACKGROUND, _FEW_IN_PEAKS = 3.0, 0.2  # errors and part of some ions, below which these are in no peak
 _PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#8c564b", "#e377c2", "#17becf", "#bcbd22")
 
 
@@ -154,6 +155,8 @@ class Spectrum:
         where = ", ".join(map(str, self.unexplained[:_SHOWN])) + (", ..." if len(self.unexplained) > _SHOWN else "")
         ranged, first = self.ranged, f"unexplained: {self.unexplained_part:.1%} of the ions in "
         lines = [first + ("ranges" if ranged else f"peaks, at {where}" if where else "peaks")]
+        if number := self.composition.without_mass:
+            lines.append(f"{number:,} of {len(self.hits):,} ions have no mass-to-charge ratio: they are not counted")
         lines += [f"range {misfit}" for misfit in self.misfits]
         lines += [f"peaks in no range at {where}"] if ranged and where else []
         lines += [] if self.flight is None else [str(self.flight)]
@@ -186,7 +189,11 @@ class Spectrum:
     @cached_property
     def composition(self) -> Composition:
         """Composition in at.%, without one where more than 10 % of the ions in peaks are unexplained."""
-        return self._composition(self._source.amounts, len(_detected(self.hits)))
+        mass = _detected(self.hits)
+        refused = ""
+        if len(mass) < FEWEST_OF_COMPOSITION:
+            refused = f"{len(mass):,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
+        return self._composition(self._source.amounts, self.unexplained_part, self.hits, refused)
 
     def composition_of(self, selection: Hits | NDArray[np.bool_]) -> Composition:
         """Composition of a part of the ions, with the ions, the shapes and the places of the whole spectrum.
@@ -203,22 +210,23 @@ class Spectrum:
         """
         if not isinstance(selection, Hits):
             selection = self.hits[check_array(selection, "selection", (len(self.hits),), dtype=bool)]
-        mass = _detected(selection)
+        mass, refused = _detected(selection), ""
         if not self.ions:
-            return self._composition(self._source.amounts, len(mass))
-        ions, covariance = self._source.amounts_of(mass)
-        return self._composition(Amounts(self._source.amounts.atoms, ions, covariance), None)
+            return self._composition(self._source.amounts, self.unexplained_part, selection)
+        ions, covariance, unexplained = self._source.amounts_of(mass)
+        total, error = ions.sum(), math.sqrt(max(float(covariance.sum()), 0.0))
+        if total < min(_CLEAR_OF_BACKGROUND * error, _FEW_IN_PEAKS * len(mass)):
+            refused = f"the {len(mass):,} ions are in no peak of an ion with a name"
+        amounts = Amounts(self._source.amounts.atoms, ions, covariance)
+        return self._composition(amounts, unexplained, selection, refused)
 
-    def _composition(self, amounts, number):
-        refused = ""
-        if number is not None and number < FEWEST_OF_COMPOSITION:
-            refused = f"{number:,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
-        elif self.ranged and self.unexplained_part > MOST_UNEXPLAINED:
+    def _composition(self, amounts, unexplained, hits, refused=""):
+        if not refused and self.ranged and self.unexplained_part > MOST_UNEXPLAINED:
             refused = (
                 f"{self.unexplained_part:.1%} of the ions in ranges are not those that the ranges name, more than "
                 f"{MOST_UNEXPLAINED:.0%}; without ranges the isotopes name the peaks"
             )
-        return amounts.composition(self.unexplained_part, refused)
+        return amounts.composition(unexplained, refused, _without_mass(hits))
 
     def candidates(self, mass: float) -> tuple[str, ...]:
         """Names of the ions that may have a peak at some m/n [Da], those that the spectrum names first.
@@ -366,6 +374,7 @@ class _Named:
         contents, ions = explanation.contents, explanation.ions
         self.calibration, self.background = explanation.calibration, contents.background
         self.profiles = IonProfiles(peaks, contents, fit.shares[chosen], explanation.amplitudes)
+        self._counted = explanation.numbers.profiles(explanation.chosen)
         errors = np.sqrt(np.maximum(np.diag(explanation.covariance), 0)).tolist() if len(ions) else []
         intervals = self.profiles.intervals()
         named = [
@@ -389,19 +398,34 @@ class _Named:
         )
         model = fit.explained(explanation.chosen, explanation.amplitudes)
         rest = contents.ions - model  # below zero where the ions should have more
+        mine = fit.shares[chosen[[ion in explanation.numbers.named_in_flanks for ion in ions]]].sum(0) > 0
+        if mine.any():  # the tails by which the contents are known are not those of the ions
+            rest[mine] = self._counted.left_over(explanation.amplitudes, contents.mass)[mine]
         large = np.abs(rest) > np.maximum(_UNLIKE * np.maximum(contents.ions, model), _FEWEST)
         large &= (np.abs(rest) > _CLEAR * np.sqrt(contents.variance)) & (contents.seen | (rest < 0))
         self.unexplained = tuple(
             UnexplainedPeak(float(contents.mass[at]), float(rest[at]), _perhaps(explanation, float(contents.mass[at])))
             for at in sorted(np.flatnonzero(large), key=lambda at: -abs(rest[at]))
         )
+        self._more = np.flatnonzero(large & (rest > 0))
+        self._more_ions = rest[self._more]
+        self._missing_part = float(-rest[large & (rest < 0)].sum() / max(float(explanation.amplitudes.sum()), 1.0))
         # ions that are there and ions that are missing may be more than all
         self.unexplained_part = min(float(np.abs(rest[large]).sum() / max(contents.total, 1.0)), 1.0)
         self.either = tuple(explanation.either.items())
 
-    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
-        """Numbers of ions and their covariance among some ions [Da]."""
-        return self.profiles.amounts(mass)
+    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats, float]:
+        """Numbers of ions and their covariance among some ions [Da], and the part of these without an explanation."""
+        ions, covariance = self._counted.amounts(mass)
+        unexplained = self._missing_part * float(ions.sum())
+        if len(self._more):
+            counted = self._counted
+            row = np.zeros((len(self._more), counted.shares.shape[1]))
+            row[np.arange(len(self._more)), self._more] = 1
+            shares, start = np.vstack([counted.shares, row]), np.append(counted.ions, self._more_ions)
+            every = IonProfiles(self._peaks, counted.contents, shares, start).amounts(mass)[0]
+            unexplained += float(every[len(ions) :].sum())
+        return ions, covariance, min(unexplained / max(float(ions.sum()) + unexplained, 1.0), 1.0)
 
     def losses(self, single: Floats, multiple: Floats, before: Composition) -> DeadTimeLoss:
         """Losses among the ions of pulses with several [Da], from those of pulses with one."""
@@ -448,9 +472,10 @@ class _Ranged:
         self.unexplained = tuple(UnexplainedPeak(place, number) for place, number in outside)
         self.amounts = Amounts([ion.atoms for ion in self._ranged.ions], ions, covariance)
 
-    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats]:
-        """Numbers of ions and their covariance among some ions [Da]."""
-        return self._ranged.amounts(mass)
+    def amounts_of(self, mass: Floats) -> tuple[Floats, Floats, float]:
+        """Numbers of ions and their covariance among some ions [Da], and the part in ranges that is wrong."""
+        ions, covariance = self._ranged.amounts(mass)
+        return ions, covariance, self._ranged.misfits(mass, ions)[1]
 
 
 def _volume(formula):
@@ -568,6 +593,12 @@ def _detected(hits):
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
         return mass[hits.detected & (mass > LOWEST) & (mass < HIGHEST)]
+
+
+def _without_mass(hits):
+    """Number of detected ions whose m/n is not a number."""
+    (mass,) = hits.require("mass_to_charge")
+    return int(np.count_nonzero(hits.detected & ~np.isfinite(mass)))
 
 
 def _warn_of_masses(hits):

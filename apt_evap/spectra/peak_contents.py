@@ -91,12 +91,13 @@ class PeakContents:
         self.places, self._smooth = find_places(self.counts, not broad)
         self.seen_at = self.scale.mass(self.places) if len(self.places) else np.zeros(0)
         """m/n of the peaks [Da]."""
-        self._tails, self._bases = _bases(self.scale)
-        self._left = _SHORT
-        if self.scale.mirrored:
-            self._bases, self._left = self._bases[:, ::-1], _LONG
+        self.tails = [length for length in _TAILS if length * float(self.scale.sigma(30.0)) < _LONGEST]
+        """Lengths of the tails to high masses."""
+        self.left = _LONG if self.scale.mirrored else _SHORT
+        self.bases = self.bases_of(_CORE)
+        """Shapes of peaks: normal, with each of the tails, shape (k, bins)."""
         self._smooth_background = _background_basis(self.scale)
-        self._mixture = np.array([*_MIXTURE[0][: len(self._tails)], *_MIXTURE[1]])
+        self._mixture = np.array([*_MIXTURE[0][: len(self.tails)], *_MIXTURE[1]])
         self._start: Floats | None = None  # amplitudes of the background of the last fit
         if len(self.places) and broad:
             self.places = self._with_shoulders(self.places)
@@ -126,9 +127,29 @@ class PeakContents:
                 mixture = np.maximum((shares[strong & ~own] * weights[:, None]).sum(0) / max(weights.sum(), 1e-9), 1e-4)
                 mixture /= mixture.sum()
         self._mixture = mixture
-        shapes = np.where(strong[:, None], shares, mixture) @ self._bases
+        shapes = np.where(strong[:, None], shares, mixture) @ self.bases
         return Contents(mass, seen, ions, self._variance(place, seen, ions, shapes, below, mixture), below, shapes,
                         np.convolve(self.counts, np.ones(2 * CORE + 1), "same"))  # fmt: skip
+
+    def bases_of(self, core: float) -> Floats:
+        """Shapes of peaks with normal distributions of some width, 0.75 for that of the scale, shape (k, bins)."""
+        from scipy.special import ndtr
+
+        size = _SHORT + _LONG + 1
+        shapes = []
+        for length, before in [(t, False) for t in self.tails] + [(t, True) for t in _TAILS_BEFORE]:
+            zero, shift = (_LONG if before else _SHORT), 0.0
+            for _ in range(2):  # with the middle of the peak, as `find_places` sees it, at its place
+                edges = (np.arange(size + 1) - zero - 0.5 + shift) / BINS
+                shape = np.diff(ndtr(edges / (core if length else core / _CORE)))
+                if length:
+                    decay = np.exp(-np.arange(size) / (BINS * length))
+                    shape = np.convolve(shape, decay / decay.sum())[:size]
+                shift = centroid(shape, int(np.argmax(shape))) - zero
+            shapes.append(shape[::-1] if before else shape)
+        bases = np.array(shapes)
+        bases[bases < 1e-7] = 0
+        return bases[:, ::-1] if self.scale.mirrored else bases
 
     def _heights(self, places):
         """Height of the histogram at some places [bins], and whether it is not that of the tail of another."""
@@ -152,7 +173,7 @@ class PeakContents:
                 ions, shares, below = self._maximise(places, height, strong, common, mixture, _ITERATIONS // 3)
                 mixture = np.maximum(shares[strong].mean(0), 1e-4)
                 mixture /= mixture.sum()
-            found = self._places_of_more(places, ions, below, mixture @ self._bases)
+            found = self._places_of_more(places, ions, below, mixture @ self.bases)
             found = found[np.abs(found[:, None] - places[height * BINS * 2.5 > _PLAIN]).min(1) < _ALONE * BINS]
             if not len(found):
                 break
@@ -178,7 +199,7 @@ class PeakContents:
         places = np.append(places, found)
         first, none = places, np.zeros(len(places), bool)
         moved = np.abs(places[:, None] - found).min(1) < _ALONE / 2 * BINS
-        shapes = np.tile(mixture @ self._bases, (len(places), 1))
+        shapes = np.tile(mixture @ self.bases, (len(places), 1))
         for _ in range(_STEPS):
             ions, _, below = self._maximise(places, self._heights(places)[0], none, none[:0], mixture, _ITERATIONS // 4)
             weights = 1 / (self.columns(places, shapes) @ ions + below + 1e-3)
@@ -193,11 +214,11 @@ class PeakContents:
         """Ions and shares of the tails of each peak, and the background, by expectation and maximisation."""
         from scipy.sparse import hstack
 
-        owner = np.repeat(np.arange(len(place)), np.where(strong, len(self._bases), 1))
+        owner = np.repeat(np.arange(len(place)), np.where(strong, len(self.bases), 1))
         first = np.concatenate([[True], owner[1:] != owner[:-1]]) if len(owner) else np.zeros(0, bool)
         kind = np.arange(len(owner)) - np.maximum.accumulate(np.where(first, np.arange(len(owner)), 0))
-        kinds = np.where(strong[owner], kind, len(self._bases))
-        peaks = self.columns(place[owner], np.vstack([self._bases, mixture @ self._bases])[kinds])
+        kinds = np.where(strong[owner], kind, len(self.bases))
+        peaks = self.columns(place[owner], np.vstack([self.bases, mixture @ self.bases])[kinds])
         every = hstack([peaks, self._smooth_background]).tocsc()
         norm = np.maximum(np.asarray(every.sum(0)).ravel(), 1e-12)
         held = np.flatnonzero(self.counts)  # other bins add zeros
@@ -210,8 +231,8 @@ class PeakContents:
             self._start = np.full(self._smooth_background.shape[1], np.percentile(self.counts, 30) / 2 + 1e-3)
             self._start /= max(float(np.median(np.asarray(self._smooth_background.sum(1)).ravel())), 1e-9)
         amplitudes[len(owner) :] = np.maximum(self._start, 1e-6 * self._start.max() + 1e-12)
-        own = kinds < len(self._bases)
-        rows = np.flatnonzero(own).reshape(-1, len(self._bases))
+        own = kinds < len(self.bases)
+        rows = np.flatnonzero(own).reshape(-1, len(self.bases))
         logs = np.log(self.scale.mass(place[strong]))
         alike = np.exp(-0.5 * ((logs[common][:, None] - logs) / _SAME_TAILS) ** 2)
         for _ in range(iterations):
@@ -223,16 +244,21 @@ class PeakContents:
                     near / np.maximum(near.sum(1, keepdims=True), 1e-300)
                 )
         self._start = amplitudes[len(owner) :].copy()
-        of_kind = np.zeros((len(place), len(self._bases)))
+        of_kind = np.zeros((len(place), len(self.bases)))
         of_kind[owner[own], kinds[own]] = amplitudes[: len(owner)][own]
         ions = np.bincount(owner, amplitudes[: len(owner)], minlength=len(place))
         shares = of_kind / np.maximum(of_kind.sum(1, keepdims=True), 1e-9)
         return ions, shares, self._smooth_background @ amplitudes[len(owner) :]
 
     @property
+    def mixture(self) -> Floats:
+        """Parts of the tails in the mean shape, shape (k,)."""
+        return self._mixture / self._mixture.sum()
+
+    @property
     def shape(self) -> Floats:
         """Mean shape of the strong peaks, shape (bins,)."""
-        return self._mixture / self._mixture.sum() @ self._bases
+        return self.mixture @ self.bases
 
     def columns(self, place: Floats, shapes: Floats) -> Any:
         """Sparse matrix of shapes of peaks at places [bins], shape (size, n)."""
@@ -242,7 +268,7 @@ class PeakContents:
         part = (place - low)[:, None]
         values = shapes * (1 - part)
         values[:, 1:] += shapes[:, :-1] * part
-        rows = low[:, None] + np.arange(-self._left, shapes.shape[1] - self._left)
+        rows = low[:, None] + np.arange(-self.left, shapes.shape[1] - self.left)
         inside = (rows >= 0) & (rows < self.scale.size) & (values > 0)
         ends = np.concatenate([[0], np.cumsum(inside.sum(1))])
         return csc_matrix((values[inside], rows[inside], ends), shape=(self.scale.size, len(place)))
@@ -250,13 +276,13 @@ class PeakContents:
     def between(self, shape: Floats, bounds: Floats) -> Floats:
         """Part of a shape between bounds relative to its place [bins], of shape (2, n)."""
         sums = np.pad(np.cumsum(shape), (1, 0))
-        low, high = np.interp(bounds + self._left + 0.5, np.arange(len(sums)), sums)
+        low, high = np.interp(bounds + self.left + 0.5, np.arange(len(sums)), sums)
         return high - low
 
     def _variance(self, place, seen, ions, shapes, below, mixture):
         """Variance of contents: the counts of the core, tails of the neighbours, and four ions."""
         model = self.columns(place, shapes) @ ions + below
-        core = float((mixture @ self._bases)[self._left - CORE : self._left + CORE + 1].sum())
+        core = float((mixture @ self.bases)[self.left - CORE : self.left + CORE + 1].sum())
         sums, sums_below = (np.pad(np.cumsum(values), (1, 0)) for values in (model, below))
         middle = np.floor(place).astype(int)
         low = np.clip(middle - CORE, 0, self.scale.size)
@@ -275,28 +301,6 @@ def _isolated(place, height):
     """Whether no other peak of some height is so near that tails could be exchanged."""
     near = (np.abs(place[:, None] - place) < _ALONE * BINS) & (height > _SMALL * height[:, None])
     return near.sum(1) < 2  # itself
-
-
-def _bases(scale):
-    """Lengths of the tails to high masses, and shapes of peaks: normal, with each of the tails, shape (k, bins)."""
-    from scipy.special import ndtr
-
-    size = _SHORT + _LONG + 1
-    tails = [length for length in _TAILS if length * float(scale.sigma(30.0)) < _LONGEST]
-    shapes = []
-    for length, before in [(t, False) for t in tails] + [(t, True) for t in _TAILS_BEFORE]:
-        zero, shift = (_LONG if before else _SHORT), 0.0
-        for _ in range(2):  # with the middle of the peak, as `find_places` sees it, at its place
-            edges = (np.arange(size + 1) - zero - 0.5 + shift) / BINS
-            shape = np.diff(ndtr(edges / (_CORE if length else 1.0)))
-            if length:
-                decay = np.exp(-np.arange(size) / (BINS * length))
-                shape = np.convolve(shape, decay / decay.sum())[:size]
-            shift = centroid(shape, int(np.argmax(shape))) - zero
-        shapes.append(shape[::-1] if before else shape)
-    bases = np.array(shapes)
-    bases[bases < 1e-7] = 0
-    return tails, bases
 
 
 def _background_basis(scale):

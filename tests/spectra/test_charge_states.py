@@ -280,7 +280,9 @@ def test_what_is_refused():
     for ions, element, options, message in (
         (bare, "Ni", {}, "these hits have no charges: pass ranges=read_ranges"),
         (bare, "Fe", {"ranges": ranges}, "ranges have no range of single atoms of Fe, only of Ni"),
-        (bare, "Xx", {"ranges": ranges}, "element must be one of"),
+        (bare, "Xx", {"ranges": ranges}, "element must be a chemical symbol such as 'Ni', got 'Xx'"),
+        (hits, "Xx", {}, "element must be a chemical symbol such as 'Ni', got 'Xx'"),
+        (hits, "ni", {}, "got 'ni'.*Ni"),
         (bare, "Ni", {"ranges": "ni.rrng"}, "ranges must be Ranges"),
         (bare, "Ni", {"ranges": ranges}, "two neighbouring charges, got charges 1"),
         (hits, 28, {}, "element must be a chemical symbol"),
@@ -307,7 +309,7 @@ def test_what_is_refused():
 
 def test_an_element_without_a_fit_has_ratios_only():
     hits = ions_in(lambda x, y: np.full(len(x), 24.5), "Ni", 1, 1000, 8)
-    result = charge_state_ratio_map(replace(hits, mass_to_charge=None), "Xx", bins=3)
+    result = charge_state_ratio_map(replace(hits, mass_to_charge=None), "Na", bins=3)
     assert np.isfinite(result.ratio).any()
     with pytest.raises(ValueError, match="element"):
         _ = result.field

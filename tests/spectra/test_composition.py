@@ -172,8 +172,8 @@ def test_a_molecule_is_not_twice_itself_with_two_charges():
     assert names == {ion_name(*ion) for ion in ions}
 
 
-def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
-    """At 184 Da isotopes are three, or two, standard deviations apart: W+ or "WH+, or W+" as it is; W+, L1 1.2."""
+def test_a_hydride_in_one_broad_peak_with_its_metal_is_told_by_the_tails_of_others():
+    """At 184 Da isotopes are three, or two, standard deviations apart: W+, or WH+ and W+; L1 0.2, 0.3 and 0.5."""
     ions = {("W", 2): 40, ("W", 1): 16, ("Y", 1): 40, ("Y", 2): 16, ("Pt", 2): 4, ("Cr", 2): 4, ("Cr", 1): 1.6}
     ions |= {("Mg", 1): 4, ("H", 1): 8}
     for hydride in ({}, {("WH", 1): 8}):
@@ -182,19 +182,54 @@ def test_a_hydride_in_one_broad_peak_with_its_metal_is_in_the_error():
         result = ae.spectrum(hits, list(expected))
         assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions | hydride}
         assert distance(result.composition, expected) < 0.6
-        for ion in result.ions if hydride else ():
-            assert ion.others == (("W⁺",) if ion.name == "WH⁺" else ())
-    assert result.composition.error["H"] > 2  # 10.9, or 5.7 without it
+        assert not any(ion.others for ion in result.ions)
+        assert abs(result.composition["H"] - expected["H"]) < 2 * result.composition.error["H"] < 3
     result = ae.spectrum(made(ions, 300_000, width=1.8e-3, tail=6e-3, error=(6e-4, -1e-3)), list(expected))
     assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
     assert distance(result.composition, truth(ions)) < 2
 
 
-def test_a_hydride_five_standard_deviations_from_its_metal_may_be_its_isotopes():
-    ions = {("W", 3): 40, ("WH", 3): 12, ("Cr", 2): 3, ("Fe", 2): 10, ("H", 1): 2}
-    result = ae.spectrum(made(ions, width=1e-3, tail=3e-3), list(truth(ions)))
-    (hydride,) = (ion for ion in result.ions if ion.name == "WH³⁺")
-    assert "W³⁺" in hydride.others and result.composition.error["H"] > 2
+@pytest.mark.parametrize("others", [{("Cr", 2): 3, ("Fe", 2): 10}, {}], ids=["taught", "alone"])
+@pytest.mark.parametrize(("part", "number", "width"), [(0, 300_000, 1.2e-3), (0.025, 300_000, 1.2e-3),
+                                                     (0.3, 60_000, 1e-3), (0.3, 300_000, 1e-3)])  # fmt: skip
+def test_a_hydride_in_the_tails_of_its_metal_is_found_or_in_the_error(others, part, number, width):
+    """WH3+ three to five standard deviations from W3+, taught by the tails of others, or by none.
+
+    30 % of it was lost, with H 3.0 ± 0.03 at.% for 17.7.
+    """
+    ions = {("W", 3): 40, ("H", 1): 2} | others | ({("WH", 3): 40 * part} if part else {})
+    hits, expected = made(ions, number, seed=2, width=width, tail=3.3 * width), truth(ions)
+    result = ae.spectrum(hits, list(expected))
+    value, error = result.composition["H"], result.composition.error["H"]
+    assert abs(value - expected["H"]) < 2 * error and result.unexplained_part < 0.001
+    if part == 0.3:  # 17.8 ± 0.5, 18.4 ± 0.4, 21.5 ± 0.6 and 21.9 ± 0.5 of 17.7 and 21.2
+        assert error < 1 and "WH³⁺" in {ion.name for ion in result.ions}
+    else:  # 3.7 ± 0.5 of 3.6, 3.6 ± 2.3 of 5.3, 4.8 ± 3.3 of 4.8 and 4.7 ± 3.9 of 6.8
+        assert error > (1 if part else 0.3) and "WH³⁺" not in {ion.name for ion in result.ions}
+    region = result.composition_of(np.ones(len(hits), bool))
+    assert region["H"] == pytest.approx(value, rel=1e-3)
+
+
+def test_a_hydride_in_flanks_leaves_nothing_unexplained():
+    """PtH2+ in the tails of Pt2+: 16 % were unexplained by the tails that the contents of the peaks have."""
+    ions = {("Pt", 2): 40, ("PtH", 2): 12, ("Pt", 1): 4, ("Cr", 2): 10, ("Cr", 1): 4, ("H", 1): 2}
+    result = ae.spectrum(made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3), list(truth(ions)))
+    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+    assert result.unexplained_part < 0.001 and distance(result.composition, truth(ions)) < 4
+
+
+def test_an_ion_in_both_flanks_of_another_is_not_its_tail():
+    """Re2+ on both sides of Nb+ and Nb+ in W2+: L1 0.6 and 0.4, and 10.1 and 3.5 as tails; U3+ is in the error."""
+    light = {("Mg", 2): 10, ("Mg", 1): 4, ("H", 1): 2}
+    rhenium = light | {("Nb", 1): 40, ("Nb", 2): 0.8, ("Re", 2): 3, ("Re", 1): 0.1}
+    niobium = light | {("W", 2): 40, ("W", 1): 2, ("Nb", 1): 1, ("Nb", 2): 0.02}
+    uranium = {("Gd", 2): 40, ("Gd", 1): 2, ("U", 3): 0.5, ("U", 2): 0.05, ("Fe", 2): 10, ("Fe", 1): 4, ("H", 1): 2}
+    for ions, most in ((rhenium, 1.5), (niobium, 1.0), (uranium, 3.0)):
+        hits, expected = made(ions, 300_000, background=0.04, width=1.2e-3, tail=4e-3), truth(ions)
+        composition = ae.spectrum(hits, list(expected)).composition
+        assert distance(composition, expected) < most
+        for element, value in expected.items():
+            assert abs(composition[element] - value) < 2 * composition.error[element]
 
 
 @pytest.mark.parametrize("number", [1500, 12_000])
@@ -318,6 +353,39 @@ def test_the_composition_of_a_region_is_its_own():
     assert again["Cr"] == pytest.approx(result.composition["Cr"], abs=0.1)
     with pytest.raises(ValueError, match="selection must have shape"):
         result.composition_of([True])
+
+
+def test_ions_in_no_peak_have_no_composition():
+    """The background between the peaks; and gold that is not among the elements, alone and with as much aluminium."""
+    hits = made({("Al", 1): 90, ("Au", 1): 5})
+    result, mass = ae.spectrum(hits, "Al"), hits.mass_to_charge
+    between, gold = (mass > 30) & (mass < 190), (mass > 196) & (mass < 199)
+    beside = result.composition_of(between)
+    assert beside.at_percent == {} and f"the {between.sum():,} ions are in no peak of an ion with a name" in str(beside)
+    lone = result.composition_of(gold)
+    assert lone.at_percent == {} and lone.unexplained > 0.98
+    assert result.composition_of(mass < 30).unexplained < 0.001
+    few = result.composition_of((mass < 30) & (np.arange(len(mass)) < 10))
+    assert few.at_percent == {"Al": 100} and few.unexplained < 0.01
+    mixed = result.composition_of(gold | ((mass > 26) & (mass < 28) & (np.arange(len(mass)) < 3500)))
+    aluminium = np.count_nonzero((mass > 26) & (mass < 28) & (np.arange(len(mass)) < 3500))
+    assert mixed.unexplained == pytest.approx(gold.sum() / (gold.sum() + aluminium), abs=0.02)
+    every = result.composition_of(hits).unexplained
+    assert every == pytest.approx(result.unexplained_part, abs=0.002)
+    ranged = ae.spectrum(hits, ranges=ae.spectra.Ranges(("Al",), [26.0], [28.0], composition=({"Al": 1},)))
+    assert ranged.composition_of(between).at_percent == {}
+
+
+def test_ions_without_a_mass_are_counted_and_said():
+    hits = made({("Al", 1): 90, ("Mg", 2): 10}, 5000)
+    mass = hits.mass_to_charge.copy()
+    mass[:12] = np.nan
+    result = ae.spectrum(ae.Hits(mass_to_charge=mass))
+    assert result.composition.without_mass == result.composition.plain()["ions_without_mass"] == 12
+    assert f"12 of {len(mass):,} ions have no mass-to-charge ratio: they are not counted" in str(result).splitlines()
+    assert result.composition_of(np.arange(len(mass)) < 500).without_mass == 12
+    assert "ions_without_mass" not in ae.spectrum(hits).composition.plain()
+    assert "no mass-to-charge" not in str(ae.spectrum(hits))
 
 
 def test_errors_follow_from_counting():

@@ -13,21 +13,9 @@ def composition_section(page: Page, spectrum: Spectrum) -> str:
     if composition.refused:
         parts.append(paragraph(f"no composition: {composition.refused}", "doubt"))
     else:
-        rows = [
-            (element, f"{value:.2f} ± {composition.error[element]:.2f}", _span(composition, element))
-            for element, value in composition.at_percent.items()
-        ]
-        rows += [
-            (f"perhaps {element}", f"0 ± {composition.error[element]:.2f}", _span(composition, element))
-            for element in composition.perhaps
-        ]
+        rows = [(name, f"{value or 0} ± {error}", span) for name, value, error, span in composition.rows()]
         parts.append(table(rows, ("", "at.%", "with other names of the peaks")))
     figure = draw_spectrum(spectrum).figure
     parts.append(page.picture(figure, alt="mass spectrum with named peaks, unexplained ones marked"))
     parts += [paragraph(line, "note") for line in of_ions[1:]]
     return collapsed("Composition", "\n".join(parts))
-
-
-def _span(composition, element):
-    low, high = composition.span[element]
-    return f"{low:.2f} to {high:.2f}" if high - low > max(composition.error[element], 0.005) else ""
