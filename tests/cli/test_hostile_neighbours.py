@@ -161,12 +161,16 @@ RUNS = {
     "visible": [("visible", "visible.toml")],
 }  # fmt: skip
 """Command lines of all commands but `explore`, `twin` and `paper`, which are below."""
-SLOW = ("index", "start", "compare")
+SLOW = ("index", "start", "compare", "planes")
 REFUSED = {
     ("map", "pickle.npz"), ("sweep", "work", "study.toml", "--point", "0"), ("sweep", "collect", "study.toml"),
     ("dataset", "study.toml", "-o", "set"), ("visible", "visible.toml"),
 }  # fmt: skip
-AGAIN = (
+AGAIN = (  # what the line before has met
+    RUNS["map"][1],
+    *RUNS["info"][1:],
+    RUNS["composition"][1],
+    RUNS["export"][0],
     ("run", "own.toml", "--resume", "--quiet"),
     ("sweep", "work", "study.toml", "--quiet"),
     ("map", "run.h5"),

@@ -293,8 +293,14 @@ def test_events_and_the_starts_of_ions_have_different_random_numbers(tip12):
 # ---- the control of the voltage ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("temperature", [25.0, 80.0])
-@pytest.mark.parametrize("rate", [0.002, 0.05])
+@pytest.mark.parametrize(
+    ("rate", "temperature"),
+    [
+        (0.002, 25.0),
+        (0.05, 80.0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.002, 80.0), (0.05, 25.0))),
+    ],
+)  # fmt: skip
 def test_the_first_voltage_gives_the_wanted_rate(tip12, temperature, rate):
     control = ae.evaporation.VoltageControl(rate=rate)
     emitter = emitter_of(tip12, ae.Arrhenius(temperature), control=control)

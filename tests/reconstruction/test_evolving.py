@@ -138,6 +138,7 @@ def test_true_sites_give_errors_without_a_fit_of_the_projection():
     np.testing.assert_allclose(found.errors(truth).lateral_rms, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     hits, _ = ions_of()
     found = evolving(hits)
@@ -194,6 +195,7 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
 
 
+@pytest.mark.slow
 def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recession():
     hits, _ = ions_of(voltage=varying())
     places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
@@ -218,6 +220,7 @@ def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recess
     assert change[:, 2].std() > 0.001 and plain.recession_changes() == []
 
 
+@pytest.mark.slow
 def test_at_the_rim_the_errors_of_fields_and_voltage_are_those_of_the_recession():
     hits, labels = ions_of(voltage=varying())
     found = evolving(hits, labels=labels)

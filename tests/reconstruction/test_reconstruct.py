@@ -142,7 +142,7 @@ def test_a_random_third_of_the_ions(cone, rng):
     assert np.abs(third.radii / whole.radii[chosen] - 1).max() < SLOPE * scatter / 30
 
 
-@pytest.mark.parametrize("protocol", ["cap", "bas"])
+@pytest.mark.parametrize("protocol", ["cap", pytest.param("bas", marks=pytest.mark.slow)])
 def test_the_voltage_of_a_cone_gives_the_shank(cone, protocol):
     shank = ae.reconstruct(cone, **SHANK, protocol=protocol)
     # the same cone ion by ion, the volume of a thin slice at a time

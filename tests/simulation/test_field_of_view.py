@@ -94,6 +94,7 @@ def test_scouts_are_among_the_launches_of_the_responses(every_ion):
     assert np.abs((scouts.velocities * emissions.normals[:, None]).sum(axis=2)).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_the_prediction_is_needed(tips, every_ion, monkeypatch):
     """Without it, with the flight at rest from the site alone and no margin, ions are lost."""
 
@@ -125,6 +126,7 @@ def test_the_margin_follows_the_energy_limit(tips, energy_limit):
             np.testing.assert_array_equal(part.hits(perturbation).detected, inside)
 
 
+@pytest.mark.slow
 def test_a_smaller_energy_limit_flies_fewer_ions(tips):
     low, high = (
         simulate(tips["nickel"], 200, 20.0, response_settings=ae.ResponseSettings(energy_limit=limit))
@@ -166,6 +168,7 @@ def test_ions_are_counted(part_of_view):
     assert f"{summary['not_flown']} ions not flown" in repr(part_of_view)
 
 
+@pytest.mark.slow
 def test_perturbations_with_their_own_flights_are_flown_for_all_ions(tips):
     perturbations = (ae.Unperturbed(), ae.RollUp(0.5))
     run = ae.Simulation(

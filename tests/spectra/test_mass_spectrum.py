@@ -92,6 +92,7 @@ def test_one_charge_state_gives_a_factor_only():
     assert abs(masses[inside].mean() / 61.28 - 1) < 2e-3
 
 
+@pytest.mark.slow
 def test_a_given_length_far_from_the_fitted_one_is_said():
     """Both numbers, and the voltages with which the given one would be right."""
     hits = recorded(NICKEL, 93.0, 20.0, (4000, 7000))
