@@ -66,6 +66,7 @@ def pytest_collection():
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(20_000, 20, 20)  # figures and pages are larger than what the defaults are for
         gc.enable()
 
 

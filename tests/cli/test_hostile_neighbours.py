@@ -114,7 +114,7 @@ def hostile(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(hostile, tmp_path, monkeypatch):
+def folder(hostile, tmp_path, monkeypatch, rough_layout):
     """A copy, in which the test works; afterwards nothing has been executed."""
     copy = tmp_path / "copy"
     shutil.copytree(hostile, copy)

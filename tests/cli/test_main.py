@@ -443,7 +443,8 @@ def test_a_signal_during_an_import_is_not_lost(tmp_path, monkeypatch, capsys):
     assert "interrupted, nothing is kept; to start again: apt-evap info a" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
     """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""
 

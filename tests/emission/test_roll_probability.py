@@ -125,7 +125,7 @@ def test_it_needs_the_neighbours():
         Migration(4.44, 35.0).probabilities(isolated)
 
 
-@pytest.mark.parametrize("metal", ["Ni", "W"])
+@pytest.mark.parametrize("metal", [pytest.param("Ni", marks=pytest.mark.slow), "W"])
 def test_the_charge_after_a_roll_up(metal):
     """The line over the charge ratio, against solved charges: fcc and bcc at R = 12 a."""
     ratio, charge, field = runpy.run_path(str(SCRIPT))["rolled"](metal, 12, 40, 500).T

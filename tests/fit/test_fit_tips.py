@@ -32,8 +32,8 @@ def runs(run_of):
 
 @pytest.fixture(scope="module")
 def few(run_of):
-    """400 ions of two of them."""
-    return {"right": run_of((1, 1, 1), 1, 400), "measured": run_of((1, 1, 1), 2, 400)}
+    """700 ions of two of them."""
+    return {"right": run_of((1, 1, 1), 1, 700), "measured": run_of((1, 1, 1), 2, 700)}
 
 
 @pytest.fixture(scope="module")

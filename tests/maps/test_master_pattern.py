@@ -26,7 +26,7 @@ def run(run_of):
 
 @pytest.fixture(scope="module")
 def few(run_of):
-    return run_of(600)
+    return run_of(1_500)
 
 
 def random_directions(rng, n):
@@ -101,7 +101,7 @@ def test_a_saved_pattern_is_read_back(few, tmp_path):
     pattern = ae.fit.master_pattern([few])
     pattern.save(tmp_path / "mine.npz")
     again = MasterPattern.load(tmp_path / "mine.npz")
-    assert (again.structure, again.apex_radius, again.ions) == ("fcc", 9.0, 600)
+    assert (again.structure, again.apex_radius, again.ions) == ("fcc", 9.0, 1_500)
     # 255 levels of the square root up to 8
     clipped = np.minimum(pattern.densities, 8.0)
     assert np.abs(np.sqrt(again.densities) - np.sqrt(clipped)).max() <= 0.5 * np.sqrt(8) / 255 + 1e-9

@@ -138,7 +138,6 @@ def test_true_sites_give_errors_without_a_fit_of_the_projection():
     np.testing.assert_allclose(found.errors(truth).lateral_rms, 0.0, atol=1e-9)
 
 
-@pytest.mark.slow
 def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     hits, _ = ions_of()
     found = evolving(hits)

@@ -140,21 +140,21 @@ def test_a_smaller_energy_limit_flies_fewer_ions(tips):
 
 def test_bits_do_not_depend_on_threads_batches_and_interruptions(tips, tmp_path):
     settings = {"flight_settings": ae.simulation.FlightSettings(field_of_view=20.0), "detector": DETECTOR, "seed": 1}
-    one = ae.Simulation(tips["alloy"], n_threads=1, **settings).run(150, progress=False)
-    two = ae.Simulation(tips["alloy"], n_threads=2, **settings).run(150, progress=False, batch_size=17)
+    one = ae.Simulation(tips["alloy"], n_threads=1, **settings).run(60, progress=False)
+    two = ae.Simulation(tips["alloy"], n_threads=2, **settings).run(60, progress=False, batch_size=17)
     path = tmp_path / "run.h5"
-    ae.Simulation(tips["alloy"], **settings).run(60, progress=False, checkpoint=path)
+    ae.Simulation(tips["alloy"], **settings).run(25, progress=False, checkpoint=path)
     resumed = ae.Simulation(tips["alloy"], **settings).run(
-        150, progress=False, checkpoint=ae.simulation.Checkpoint(path, resume=True)
+        60, progress=False, checkpoint=ae.simulation.Checkpoint(path, resume=True)
     )
-    assert 0 < one.not_flown.sum() < 150
+    assert 0 < one.not_flown.sum() < 60
     for run in (two, resumed, ae.load(path)):
         assert run.fingerprint() == one.fingerprint()
         np.testing.assert_array_equal(run.not_flown, one.not_flown)
         assert run.field_of_view == 20.0
     with pytest.raises(ae.FileError, match="flights"):
         settings["flight_settings"] = ae.simulation.FlightSettings(field_of_view=25.0)
-        ae.Simulation(tips["alloy"], **settings).run(200, checkpoint=ae.simulation.Checkpoint(path, resume=True))
+        ae.Simulation(tips["alloy"], **settings).run(80, checkpoint=ae.simulation.Checkpoint(path, resume=True))
 
 
 def test_ions_are_counted(part_of_view):

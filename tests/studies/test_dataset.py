@@ -566,7 +566,6 @@ def test_nothing_outside_the_folder_is_read(made, tmp_path, what):
             ae.load_dataset(folder).table("ions" if what == "link" else table)
 
 
-@pytest.mark.slow
 def test_a_link_in_a_set_is_not_written_through(tmp_path):
     """An unfinished set of somebody else, whose next file is a link to a file of this user."""
     plan = planned(tmp_path)
