@@ -161,7 +161,7 @@ RUNS = {
     "visible": [("visible", "visible.toml")],
 }  # fmt: skip
 """Command lines of all commands but `explore`, `twin` and `paper`, which are below."""
-SLOW = ("index", "start", "compare", "planes")
+SLOW = ("index", "start", "compare")
 REFUSED = {
     ("map", "pickle.npz"), ("sweep", "work", "study.toml", "--point", "0"), ("sweep", "collect", "study.toml"),
     ("dataset", "study.toml", "-o", "set"), ("visible", "visible.toml"),

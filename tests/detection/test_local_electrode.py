@@ -181,7 +181,6 @@ def test_there_and_back(lens):
     assert np.isnan(lens.projection(40.0).flight_angles(50.1)) and np.isnan(lens.projection(40.0).cap_angles(60.0))
 
 
-@pytest.mark.slow
 def test_which_ions_pass(lens):
     """The aperture stops ions at about its angle seen from the apex, times the compression."""
     straight = math.degrees(math.atan(0.5))

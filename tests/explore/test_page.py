@@ -676,7 +676,6 @@ def test_one_button_simulates_the_specimen(measured, tmp_path, monkeypatch):
     opened.page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("spectra_once")
 def test_candidates_of_a_search_are_those_of_its_ions():
     """Other ions, on the same page or in a file of the same name, have none; marks and their fits are kept."""
@@ -836,7 +835,6 @@ def test_strays_are_counted_as_by_the_shell_and_told_on_the_page(tmp_path, monke
     page.close()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("spectra_once")
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.DataWarning")
 def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):

@@ -96,6 +96,7 @@ def test_a_single_tip_is_the_study_of_its_own_region(few, tmp_path):
     region = fit.studies["right"].measured.mask
     assert not (region & ~alone.measured.mask).any()
     assert np.isnan(fit.shares["right"]) and fit.rows()[0]["share"] is None
+    assert fit.order == [fit.best] == ["right"] and repr(fit).startswith("<TipFit: 1 runs, 0 failed; best 'right'")
 
 
 def test_a_run_without_responses_is_reported(few, nickel):

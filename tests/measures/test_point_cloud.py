@@ -234,16 +234,15 @@ def test_wrong_arguments_are_named(call, message):
         call(blurred_ball(1, 2000))
 
 
-@pytest.mark.slow
 def test_sites_of_a_run_and_its_reconstruction():
     """The same measure of both: elements of two phases are one, and a perfect position has the same neighbours."""
     core = ae.specimen.Phase("core", "Ni", ae.specimen.Sphere((0, 0, 2.0), 0.8), solutes={"Al": 0.5})
     tip = ae.Tip(phases=[ae.specimen.Phase("matrix", "Ni", solutes={"Al": 0.05}), core], apex_radius=2.5, seed=1)
     run = ae.Simulation(tip, seed=1, flight_settings=ROUGH["flight_settings"]).run(
-        300, [ae.Unperturbed()], responses=False, progress=False
+        200, [ae.Unperturbed()], responses=False, progress=False
     )
     sites = run.sites()
-    assert sites.names == ("Ni", "Al") and len(sites) == 300
+    assert sites.names == ("Ni", "Al") and len(sites) == 200
     assert sites.mark("Al").sum() == sum(run.elements[k] == "Al" for k in run.species)
     assert np.array_equal(sites.positions, run.emissions.positions)
     hits = run.hits(ae.Unperturbed())

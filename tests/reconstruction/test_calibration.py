@@ -107,7 +107,6 @@ def test_the_compression_from_poles():
         ae.reconstruction.compression_from_poles([54.74], [0.0])
 
 
-@pytest.mark.slow
 def test_planes_are_found_where_there_are_some_and_not_by_chance():
     rng = np.random.default_rng(4)
     ions = rng.random((600, 3)) * (2, 2, 6)
