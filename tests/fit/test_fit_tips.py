@@ -32,8 +32,9 @@ def runs(run_of):
 
 @pytest.fixture(scope="module")
 def few(run_of):
-    """700 ions of two of them."""
-    return {"right": run_of((1, 1, 1), 1, 700), "measured": run_of((1, 1, 1), 2, 700)}
+    """700 ions of them."""
+    tips = {"right": ((1, 1, 1), 1), "axis": ((0, 0, 1), 1), "measured": ((1, 1, 1), 2)}
+    return {name: run_of(*tip, 700) for name, tip in tips.items()}
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +53,9 @@ def test_the_tip_and_its_energies_are_found(fit):
     assert fit.shares == {"axis": 0.0, "right": 1.0}
 
 
-@pytest.mark.slow
-def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(fit):
+def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(few):
+    candidates = {name: few[name] for name in ("axis", "right")}
+    fit = fit_tips(candidates, few["measured"].hits(ROLLUP), registration=HERE, bins=32, resamples=2, **GRID)
     first, second = fit.studies.values()
     assert (first.measured.mask == second.measured.mask).all() and first.measured.mask.any()
     assert first.settings == second.settings
