@@ -44,6 +44,8 @@ DRAWN = (  # of an artist of Matplotlib: what it shows
     *("get_text", "get_xydata", "get_array", "get_clim", "get_extent", "get_offsets", "get_paths", "get_path"),
     *("get_color", "get_facecolor", "get_edgecolor", "get_alpha", "get_visible", "get_xlim", "get_ylim"),
 )
+FLOWN20 = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
+OPTIONS20 = {"voltage": 1000.0, "seed": 1, "detector": ae.Detector(distance=100.0, width=300.0), **ROUGH}
 PACKAGES_OF_RUNS = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
 
 # a shell that has put the tests into the background lets them ignore Ctrl-C, which some of them press
@@ -51,7 +53,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # examples are not timed: the machine may be slow or busy
 untimed = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]}
-settings.register_profile("quick", max_examples=25, derandomize=True, **untimed)
+settings.register_profile("quick", max_examples=15, derandomize=True, **untimed)
 settings.register_profile("thorough", max_examples=300, **untimed)
 settings.load_profile("quick")
 
@@ -64,6 +66,7 @@ def pytest_collection():
         return (yield)
     finally:
         gc.freeze()
+        gc.set_threshold(20_000, 20, 20)  # figures and pages are larger than what the defaults are for
         gc.enable()
 
 
@@ -208,9 +211,13 @@ def tip20(nickel):
 @pytest.fixture(scope="session")
 def run20(tip20, made_once):
     """15,000 ions of `tip20`, each flown at rest and rolled up, with responses."""
-    detector = ae.Detector(distance=100.0, width=300.0)
-    flown = (ae.Unperturbed(), ae.RollUp(ae.TruncatedNormal(0.155, 0.155)))
-    return made_once(tip20, 15_000, flown, voltage=1000.0, seed=1, detector=detector, **ROUGH)
+    return made_once(tip20, 15_000, FLOWN20, **OPTIONS20)
+
+
+@pytest.fixture(scope="session")
+def few20(tip20, made_once):
+    """The first 6,000 ions of `run20`, for tests that are not slow."""
+    return made_once(tip20, 6_000, FLOWN20, **OPTIONS20)
 
 
 @pytest.fixture(scope="session")

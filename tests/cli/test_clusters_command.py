@@ -22,6 +22,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_clusters_of_a_file(folder, capsys):
     assert main(["clusters", "R1.pos", "--ranges", "R1.rrng", "--solute", "Cu", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

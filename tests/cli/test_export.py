@@ -75,12 +75,14 @@ def test_a_run_as_nxapm(folder, small_tip):
     np.testing.assert_array_equal(ae.read("run.nxs").x, hits[hits.detected].x)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_reconstruct_an_instrument_file(folder):
     command = ["reconstruct", "oxcart.h5", "--element", "Al", "--distance", "110", "-o", "rec.pos", "--quiet"]
     assert main(command) == 0
     assert len(ae.read("rec.pos")) == 400
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_species_of_a_run_are_known(tmp_path, monkeypatch, capsys, nickel):
     monkeypatch.chdir(tmp_path)
     tip = ae.Tip(nickel, apex_radius=5 * nickel.a, axis=(1, 1, 1), solutes={"Cu": 0.3}, seed=1)

@@ -114,7 +114,7 @@ def hostile(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(hostile, tmp_path, monkeypatch):
+def folder(hostile, tmp_path, monkeypatch, rough_layout):
     """A copy, in which the test works; afterwards nothing has been executed."""
     copy = tmp_path / "copy"
     shutil.copytree(hostile, copy)
@@ -166,7 +166,11 @@ REFUSED = {
     ("map", "pickle.npz"), ("sweep", "work", "study.toml", "--point", "0"), ("sweep", "collect", "study.toml"),
     ("dataset", "study.toml", "-o", "set"), ("visible", "visible.toml"),
 }  # fmt: skip
-AGAIN = (
+AGAIN = (  # what the line before has met
+    RUNS["map"][1],
+    *RUNS["info"][1:],
+    RUNS["composition"][1],
+    RUNS["export"][0],
     ("run", "own.toml", "--resume", "--quiet"),
     ("sweep", "work", "study.toml", "--quiet"),
     ("map", "run.h5"),

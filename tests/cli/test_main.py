@@ -85,6 +85,7 @@ def failed(capsys, *arguments):
 # ---- run -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_run_writes_run_and_picture_and_says_so(folder, capsys):
     assert main(["run", "small.toml", "--threads", "1"]) == 0
     out, err = capsys.readouterr()
@@ -143,6 +144,7 @@ def test_the_bar_of_a_run_fits_a_terminal(monkeypatch, capsys):
     assert len(text.split("|")[1]) >= 20
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_run_is_that_of_python_whatever_the_threads(folder, made):
     assert main(["run", "small.toml", "--threads", "2", "--quiet"]) == 0
     one, two = load(made), load("small.h5")
@@ -441,7 +443,8 @@ def test_a_signal_during_an_import_is_not_lost(tmp_path, monkeypatch, capsys):
     assert "interrupted, nothing is kept; to start again: apt-evap info a" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("sent", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_that_goes_on_does(folder, monkeypatch, capsys, sent):
     """What is printed after an interrupt is run as it stands, and gives the run that was asked for first."""
 
@@ -489,6 +492,7 @@ def drawn_by(monkeypatch, *arguments):
     return drawn["maps"], drawn["titles"]
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_map_of_a_run_shows_the_whole_detector(folder, made, monkeypatch, capsys):
     maps, titles = drawn_by(monkeypatch, "map", made)
     assert capsys.readouterr().out == "wrote small_map.png\n" and (folder / "small_map.png").exists()
@@ -860,6 +864,7 @@ def test_a_command_leaves_the_environment_as_it_is(made, monkeypatch, capsys):
     assert dict(os.environ) == before
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_a_picture_is_drawn_before_its_file_is_opened(made, folder, monkeypatch):
     """A kill while it is drawn, which takes a second, leaves nothing behind."""
     seen = []
@@ -875,6 +880,7 @@ def test_a_picture_is_drawn_before_its_file_is_opened(made, folder, monkeypatch)
     assert seen == before and imread("map.png").ndim == 3
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_a_table_that_has_no_effect_is_told(folder, capsys):
     text = SMALL + "responses = false\n[responses]\nheight = 0.1\n"
     (folder / "a.toml").write_text(text.replace("ions = 60", "ions = 5"))

@@ -143,7 +143,8 @@ def test_every_option_of_reading_is_here():
 
 
 CASES = [
-    pytest.param(words, id=" ".join(words), marks=[pytest.mark.slow] if "3" in words else [])  # fits the flight
+    # "3" fits the flight; all options are read alone or together, all formats slowly
+    pytest.param(words, id=" ".join(words), marks=[pytest.mark.slow] if "3" in words or words in FORMATS else [])
     for words in (*OPTIONS.values(), *TOGETHER, *FORMATS)
     if words[0] != "little.pos"  # no places on a detector
 ]

@@ -33,6 +33,7 @@ def measured(tmp_path, monkeypatch, rng):
     return ae.read("ni.epos")
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_measured_ions(measured, nickel, tmp_path, capsys):
     command = ["reconstruct", "ni.epos", "--element", "Ni", "--distance", "90", "--efficiency", "0.6"]
     assert main([*command, "--compression", "1.6"]) == 0
@@ -123,6 +124,7 @@ def test_wrong_options_are_one_sentence(measured, capsys, tmp_path, options, sen
     assert [path.name for path in tmp_path.iterdir()] == ["ni.epos"]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_all_that_a_file_lacks_is_named_at_once_and_is_enough(measured, tmp_path, rng, capsys):
     """A file as exported, without voltages and with positions of its own, of nickel by its isotopes."""
     masses = rng.choice([57.935, 59.931, 61.928], 2000, p=[0.70, 0.265, 0.035])

@@ -41,6 +41,7 @@ def selected(*words):
     return measured_of(make_parser("index").parse_args(["index", *map(str, words)]))
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_peaks_are_named_drawn_and_saved(alloy, tmp_path, capsys):
     saved, picture = tmp_path / "a.rrng", tmp_path / "a.png"
     assert main(["spectrum", str(alloy), "--save", str(saved), "-o", str(picture), "--json"]) == 0
@@ -65,6 +66,7 @@ def test_ions_without_a_mass_have_no_spectrum(tmp_path, capsys, monkeypatch, mas
     assert [path.name for path in tmp_path.iterdir()] == ["a.pos"]
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_ranges_of_a_file_are_drawn_and_counted(alloy, tmp_path, capsys):
     names = {"Ni": (57.0, 61.5), "Al": (26.5, 27.5)}
     low, high = np.array(list(names.values())).T

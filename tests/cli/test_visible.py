@@ -49,6 +49,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.usefixtures("rough_layout")
 def test_an_answer_and_its_operators(folder, capsys):
     arguments = ["visible", str(folder / "particle.toml"), "--threads", "1"]
     assert main([*arguments, "--json"]) == 0

@@ -90,6 +90,13 @@ FILES = {
     "pulses that are not consistent": with_change(lambda rows, values: rows.__setitem__((slice(100, 103), 10), 9)),
     "truncated": with_change(_none)[:-60],
 }
+
+
+def files(*telling):
+    """Names of all files: those that are not telling are slow."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in telling)) for name in FILES]
+
+
 OPTIONS = {
     "truncated": ["--partial"],
     "centimetres": ["--unit", "cm"],
@@ -116,7 +123,7 @@ def answers(capsys, *words):
     return code, out.out, out.err
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", files("strays and not finite", "kilovolts", "pulses of every ion", "truncated"))
 def test_blocks_give_the_answers_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.epos").write_bytes(FILES[name])
@@ -150,7 +157,7 @@ def map_of(words):
 
 
 @pytest.mark.parametrize("bins", [[], ["--bins", "50"]])
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", files("strays and not finite", "quantised", "centimetres", "truncated"))
 def test_blocks_give_the_map_of_the_whole_file(tmp_path, monkeypatch, blocks_of, name, bins):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.epos").write_bytes(FILES[name])
@@ -169,7 +176,7 @@ def test_blocks_give_the_map_of_the_whole_file(tmp_path, monkeypatch, blocks_of,
 
 
 @pytest.mark.usefixtures("hashed_pictures", "spectra_once")
-@pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
+@pytest.mark.parametrize("name", [*files("plain", "negative")[:3], "negative"])
 def test_blocks_give_the_spectrum_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
     """The picture, too; what is said of pulses and voltages, which a spectrum does not need, may be missing."""
     monkeypatch.chdir(tmp_path)
@@ -196,6 +203,7 @@ def test_the_sample_of_blocks_is_that_of_all_ions(monkeypatch, rows):
     assert all(map(np.array_equal, field.sample, (x[::3], y[::3])))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("hashed_pictures", "spectra_once")
 def test_losses_of_blocks_are_those_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of):
     """Isotopes that are lost in pulses of several ions, which a note beside every composition says."""
@@ -230,6 +238,7 @@ def test_a_pos_is_read_in_blocks(tmp_path, monkeypatch, capsys, blocks_of):
     assert all(one == given[0] for one in given)
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch, blocks_of):
     monkeypatch.chdir(tmp_path)
     blocks_of(1 << 12)
@@ -288,7 +297,7 @@ def test_counts_of_a_picture_are_those_of_numpy(dtype):
 
 
 @pytest.mark.usefixtures("hashed_pictures")
-@pytest.mark.parametrize("name", ["plain", "strays", "not finite", "negative"])
+@pytest.mark.parametrize("name", [*files("plain", "negative")[:3], "negative"])
 def test_blocks_give_the_reconstruction_of_the_whole_file(tmp_path, monkeypatch, capsys, blocks_of, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.epos").write_bytes(FILES[name])

@@ -141,6 +141,7 @@ def verlet(lens, angle, steps):
     return math.degrees(math.atan2(*velocity))
 
 
+@pytest.mark.slow
 def test_a_slow_twin_of_the_flights(lens):
     solved = lens.lens(50.0)
     for angle in (10.0, 30.0):

@@ -81,7 +81,7 @@ def add_strays(kind, x, y):
 
 @pytest.mark.parametrize("kind", ["one", "near", "two", "huge", "scales", "sentinel", "half", "line"])
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("dtype", ["f4", pytest.param("f8", marks=pytest.mark.slow)])
 def test_strays_are_found(kind, shape, dtype):
     for n in (1200, 20_000):
         places = field_of_view(shape, n, 24)

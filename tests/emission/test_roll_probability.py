@@ -125,7 +125,7 @@ def test_it_needs_the_neighbours():
         Migration(4.44, 35.0).probabilities(isolated)
 
 
-@pytest.mark.parametrize("metal", ["Ni", "W"])
+@pytest.mark.parametrize("metal", [pytest.param("Ni", marks=pytest.mark.slow), "W"])
 def test_the_charge_after_a_roll_up(metal):
     """The line over the charge ratio, against solved charges: fcc and bcc at R = 12 a."""
     ratio, charge, field = runpy.run_path(str(SCRIPT))["rolled"](metal, 12, 40, 500).T
@@ -150,14 +150,14 @@ def test_migration_of_an_alloy_warns():
     run.hits(ae.RollUp(0.1, ae.emission.ChargeRatio(0.8)))  # no warning, which would be an error
 
 
-def test_migration_with_robins_charges_warns(tip12):
+def test_migration_with_robins_charges_warns(small_tip):
     """Its line over the charge ratios is that of a constant potential: nickel rolls 1.5 times too often otherwise."""
     settings, law = ae.ResponseSettings(energy_limit=20.0), ae.RollUp.of_metal("Ni")
     nested = ae.emission.Mixture(
         (ae.RollUp(0.2), ae.emission.Mixture((ae.Combined(0.1, 0.5, Migration.of("Ni")), law)))
     )
     robin, constant = (
-        ae.Simulation(tip12, seed=1, n_threads=1, response_settings=settings, rule=rule).run(60, progress=False)
+        ae.Simulation(small_tip, seed=1, n_threads=1, response_settings=settings, rule=rule).run(60, progress=False)
         for rule in (ae.Robin(), ae.ConstantPotential())
     )
     for perturbation in (law, nested, ae.RollUp(0.1, Migration.of("Ni"))):
@@ -169,8 +169,8 @@ def test_migration_with_robins_charges_warns(tip12):
         warnings.simplefilter("error")
         constant.hits(law), constant.hits(nested)
         robin.hits(ae.RollUp(0.1, ae.emission.ChargeRatio(0.8)))
-        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=Migration.of("Ni")), rule=ae.ConstantPotential())
+        ae.evaporation.Emitter(small_tip, law=ae.Extremal(hop=Migration.of("Ni")), rule=ae.ConstantPotential())
     with pytest.warns(EmissionWarning):
-        ae.evaporation.Emitter(tip12, law=ae.Extremal(hop=Migration.of("Ni")))
+        ae.evaporation.Emitter(small_tip, law=ae.Extremal(hop=Migration.of("Ni")))
     shares = [law.probability.probabilities(run.emissions).mean() for run in (robin, constant)]
     assert shares[0] > 1.2 * shares[1] > 0

@@ -24,7 +24,10 @@ field_reference = "{}"
 """
 
 
-@pytest.mark.parametrize(("name", "radius"), [("Ti", 5.0), ("Zr", 5.0), ("Mg", 5.0), ("Ti", 6.0), ("Be", 6.0)])
+@pytest.mark.parametrize(("name", "radius"), [
+    ("Ti", 5.0), ("Be", 6.0),
+    *(pytest.param(*case, marks=pytest.mark.slow) for case in (("Zr", 5.0), ("Mg", 5.0), ("Ti", 6.0))),
+])  # fmt: skip
 def test_a_facet_is_no_cap(name, radius):
     """The rounds end with 0 to 11 atoms on the facet: before, a field of 0, or 747 V/nm and a radius of 0.43 nm."""
     metal = ae.material(name)

@@ -49,7 +49,7 @@ def test_relaxations_and_deepening_are_paused_for(nickel):
         yield
         paused.append(len(emitter.tip) > before)
 
-    statuses = [batch.status for batch in emitter.advance(500, pause=pause)]
+    statuses = [batch.status for batch in emitter.advance(300, pause=pause)]
     assert len(paused) == sum(status in (SWEEP_DUE, TOO_SHALLOW) for status in statuses)
     assert sum(paused) == statuses.count(TOO_SHALLOW) >= 1
 

@@ -143,15 +143,16 @@ def test_a_hop_does_not_depend_on_threads_and_batches(nickel):
 
 def test_a_run_with_hops_is_resumed_bit_by_bit(small_tip, tmp_path):
     def run(n_ions, path=None):
-        law, charges = ae.Extremal(hop=Migration.of("Ni")), ae.evaporation.ChargeSettings(sweep_interval=30)
+        law, charges = ae.Extremal(hop=Migration.of("Ni")), ae.evaporation.ChargeSettings(sweep_interval=10)
         simulation = ae.Simulation(small_tip, seed=2, law=law, charge_settings=charges)
         checkpoint = None if path is None else ae.simulation.Checkpoint(path, resume=True)
         return simulation.run(n_ions, responses=False, progress=False, checkpoint=checkpoint)
 
-    run(50, tmp_path / "run.h5")
-    assert run(80, tmp_path / "run.h5").fingerprint() == run(80).fingerprint()
+    run(16, tmp_path / "run.h5")
+    assert run(26, tmp_path / "run.h5").fingerprint() == run(26).fingerprint()
 
 
+@pytest.mark.slow
 def test_atoms_that_cannot_hop_leave_as_without_the_law():
     """Aluminium's barrier is above all gains."""
     tip = ae.Tip("Al", apex_radius=3.0, axis=(1, 1, 1), offset_seed=1)
@@ -176,6 +177,7 @@ def test_a_hop_does_not_depend_on_where_ions_can_roll(tip12):
     assert np.array_equal(sequence(first), sequence(second))
 
 
+@pytest.mark.slow
 def test_bonds_change_the_field_of_evaporation_and_not_that_of_the_hop(tip12):
     """With fields that bonds raise out of reach, all atoms leave by a hop; with low ones none does."""
     law = Migration.of("Ni")

@@ -268,16 +268,18 @@ def test_the_seed_changes_the_sequence_and_nothing_else_does(small_tip):
     assert same(columns, history_of(emitter_of(small_tip, law, seed=2), 120)) == [False] * 4
 
 
-def test_threads_and_batches_leave_the_bits(shell):
+@pytest.mark.parametrize(
+    ("batch_size", "n_threads"),
+    [(7, 2), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((256, 2), (1, 1)))],
+)
+def test_threads_and_batches_leave_the_bits(shell, batch_size, n_threads):
     def columns(batch_size=256, n_threads=1):
         emitter = emitter_of(shell, ae.Arrhenius(60.0), seed=11, n_threads=n_threads)
         events = history_of(emitter, 260, batch_size)
         assert len(emitter.tip) > len(shell)  # it was deepened
         return [*events, emitter.charges, emitter.control_voltage]
 
-    expected = columns()
-    for options in ({"n_threads": 2}, {"batch_size": 1}, {"batch_size": 7, "n_threads": 2}):
-        assert same(expected, columns(**options)) == [True] * 6
+    assert same(columns(), columns(batch_size, n_threads)) == [True] * 6
 
 
 def test_events_and_the_starts_of_ions_have_different_random_numbers(tip12):
@@ -293,8 +295,14 @@ def test_events_and_the_starts_of_ions_have_different_random_numbers(tip12):
 # ---- the control of the voltage ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("temperature", [25.0, 80.0])
-@pytest.mark.parametrize("rate", [0.002, 0.05])
+@pytest.mark.parametrize(
+    ("rate", "temperature"),
+    [
+        (0.002, 25.0),
+        (0.05, 80.0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.002, 80.0), (0.05, 25.0))),
+    ],
+)  # fmt: skip
 def test_the_first_voltage_gives_the_wanted_rate(tip12, temperature, rate):
     control = ae.evaporation.VoltageControl(rate=rate)
     emitter = emitter_of(tip12, ae.Arrhenius(temperature), control=control)

@@ -288,9 +288,9 @@ def test_rings_about_the_pole(run20):
         assert one.contrast == pytest.approx(moved.contrast, abs=4 * (one.error + moved.error))
 
 
-def test_poles_over_the_maps(run20):
+def test_poles_over_the_maps(few20):
     """They lie where the registration puts the run, and only on the detector."""
-    run = replace(run20, perturbations=(), flown=())
+    run = replace(few20, perturbations=(), flown=())
     hits = TURNED.hits(run.hits(ae.Unperturbed()))
     explorer = Explorer(run, ae.Hits(x=hits.x, y=hits.y).within_circle(30.0, TURNED.shift), TURNED)
     settings = ExplorerSettings(ae.Unperturbed(), 64, 2.0)
@@ -305,14 +305,14 @@ def test_poles_over_the_maps(run20):
     assert Explorer(bare).poles.overlay(Explorer(bare).show(settings), None) is None
 
 
-def test_a_run_is_registered_where_the_indexed_map_has_its_axis(run20, measured, monkeypatch):
+def test_a_run_is_registered_where_the_indexed_map_has_its_axis(few20, measured, monkeypatch):
     """The map is indexed once, in the process of the search; a map that does not decide gives no start."""
     candidate = SimpleNamespace(
         orientation=ae.Orientation("Ni", axis=(1, 1, 1)), projection=ae.detection.Projection(60.0, centre=(4.0, -3.0))
     )
     called = []
     for decided in (True, False):
-        explorer = Explorer(run20, measured)
+        explorer = Explorer(few20, measured)
         indexing = SimpleNamespace(decided=decided, best=candidate, map=measured.map(64))
 
         def call(function, arguments, *_, indexing=indexing):

@@ -57,7 +57,7 @@ def test_times_of_flight_without_a_length_are_said_to_need_one(hits):
 @pytest.mark.parametrize(
     "selection",
     [
-        IonSelection("Cu", ions=(100, 10_000)),
+        pytest.param(IonSelection("Cu", ions=(100, 10_000)), marks=pytest.mark.slow),
         IonSelection(mass=(13.5, 15.5)),
         IonSelection(mass=(None, 20.0), ions=(None, 9_000)),
         IonSelection(ions=(500, 700)),

@@ -80,6 +80,14 @@ def opened(run, measured):
     opened.page.close()
 
 
+@pytest.fixture(scope="module")
+def shared(run, measured):
+    """Such a page for tests that leave it as it was."""
+    opened = Opened(Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)), preview=500))
+    yield opened
+    opened.page.close()
+
+
 def _limits(page):
     return [(each.low, each.high) for each in page.figures.colors]
 
@@ -152,6 +160,7 @@ def test_every_widget_moves_something(opened):
     assert page.settings().perturbation == ae.Unperturbed(page.emission.sliders["height"].value)
 
 
+@pytest.mark.slow
 def test_a_preview_is_grey(opened):
     page = opened.page
     opened.settle(lambda: "rings about 111" in page.rings.text.text or "not here" in page.rings.text.text)
@@ -203,9 +212,9 @@ def test_only_the_newest_maps_are_computed(opened, monkeypatch):
     assert computed[-1] == page.settings() and page.settings().perturbation.energy.mean == 0.4
 
 
-def test_difference_and_blink(opened):
-    page = opened.page
-    opened.settle(opened.shows)
+def test_difference_and_blink(shared):
+    page = shared.page
+    shared.settle(shared.shows)
     first, second = page.maps.pictures
     page.figures.mode.active = MODES.index("difference")
     assert page.figures.difference_image.visible and page.figures.figures[1].title.text == "simulated - measured"
@@ -230,8 +239,8 @@ def test_difference_and_blink(opened):
     assert page.document.session_callbacks == [] and not page.figures.blink_image.visible
 
 
-def test_linked_maps(opened):
-    first, second = opened.page.figures.figures
+def test_linked_maps(shared):
+    first, second = shared.page.figures.figures
     assert first.x_range is second.x_range and first.y_range is second.y_range
 
 
@@ -292,8 +301,8 @@ def test_the_specimen_follows_the_ions(opened):
     assert np.allclose(view.points.data["z"] + view.centre[2], drawn.positions[:, 2], atol=1e-5)
 
 
-def test_a_rectangle_gives_commands(opened):
-    page = opened.page
+def test_a_rectangle_gives_commands(shared):
+    page = shared.page
     box = {"type": "rect", "x0": -10.0, "x1": 5.0, "y0": 0.0, "y1": 8.0}
     page.code._selected(SimpleNamespace(geometry=box, final=False))
     assert "window" not in page.code.python.text
@@ -360,8 +369,8 @@ def test_a_measurement_alone(measured):
     page.close()
 
 
-def test_each_map_has_its_own_scale(opened):
-    page = opened.page
+def test_each_map_has_its_own_scale(shared):
+    page = shared.page
     own = _limits(page)
     assert own == [color_limits(each) for each in page.maps.pictures]
     page.figures.same_scale.active = True
@@ -382,8 +391,8 @@ def test_what_is_not_compared_is_dimmed(run, measured):
     page.close()
 
 
-def test_groups_are_reset(opened):
-    page = opened.page
+def test_groups_are_reset(shared):
+    page = shared.page
     start = page.settings()
     for slider in (page.emission.sliders["mean"], page.display.smoothing, page.display.bins):
         throttled(slider, slider.start + 0.5 * (slider.end - slider.start) // 1)
@@ -392,15 +401,15 @@ def test_groups_are_reset(opened):
     for reset in (page.emission.reset, page._reset_display, page.ions.reset):
         reset()
     assert page.settings() == start
-    opened.settle(opened.shows)
+    shared.settle(shared.shows)
 
 
-def test_a_number_is_typed(opened):
+def test_a_number_is_typed(shared):
     """The field beside a slider moves it, and the slider the field."""
-    (field,) = opened.page.document.select({"type": Spinner, "name": "mean energy [eV]"})
-    assert field.value == opened.page.emission.sliders["mean"].value
+    (field,) = shared.page.document.select({"type": Spinner, "name": "mean energy [eV]"})
+    assert field.value == shared.page.emission.sliders["mean"].value
     (callback,) = field.js_property_callbacks["change:value_throttled"]
-    assert callback.args["slider"] is opened.page.emission.sliders["mean"]
+    assert callback.args["slider"] is shared.page.emission.sliders["mean"]
 
 
 @pytest.mark.slow
@@ -755,6 +764,7 @@ def boxes_of_labels(panel):
     return dict(zip(data["label"], zip(x, y, x + widths, y + 17.0, strict=True), strict=True)), (wide, high)
 
 
+@pytest.mark.slow
 def test_labels_of_the_spectrum_are_apart_at_any_zoom(tmp_path, monkeypatch):
     """Those of the largest peaks are there; zoomed, there is a place for all."""
     monkeypatch.chdir(tmp_path)
@@ -794,6 +804,7 @@ def test_labels_of_the_spectrum_are_apart_at_any_zoom(tmp_path, monkeypatch):
     opened.page.close()
 
 
+@pytest.mark.slow
 def test_strays_are_counted_as_by_the_shell_and_told_on_the_page(tmp_path, monkeypatch, capfd):
     """A misread signal far outside is one of the ions of the file, not of those that are shown, also in a search."""
     monkeypatch.chdir(tmp_path)
@@ -862,9 +873,9 @@ def test_ranges_name_the_peaks_and_typed_numbers_stay(tmp_path, monkeypatch):
     page.close()
 
 
-def test_pictures_of_atoms_have_a_scale(opened):
+def test_pictures_of_atoms_have_a_scale(shared):
     """A bar in nanometres, of the range in which positions are drawn."""
-    panels = opened.page.specimen.view, opened.page.reconstruction.view, opened.page.reconstruction.truth
+    panels = shared.page.specimen.view, shared.page.reconstruction.view, shared.page.reconstruction.truth
     for view in panels:
         (bar,) = [model for model in view.figure.below + view.figure.center if model.__class__.__name__ == "ScaleBar"]
         assert bar.unit == "nm" and bar.range is view.figure.x_range
@@ -948,9 +959,9 @@ def test_a_file_is_opened(measured):
     opened.settle(lambda: made == ["good"])
 
 
-def test_a_slider_of_the_document_runs_the_callback(opened):
+def test_a_slider_of_the_document_runs_the_callback(shared):
     """The widgets are in the document, where a browser finds them."""
-    titles = {each.title for each in opened.page.document.select({"type": Slider})}
+    titles = {each.title for each in shared.page.document.select({"type": Slider})}
     assert {"mean energy [eV]", "smoothing [mm]", "bins"} <= titles
 
 

@@ -13,17 +13,28 @@ GRID = {"means": (0.05, 0.155, 0.3), "relative_spreads": (0.316, 1.0), "progress
 
 
 @pytest.fixture(scope="module")
-def runs(nickel, made_once):
-    """1,500 ions of three tips: two along [111], of different origins of the lattice, and one along [001]."""
+def run_of(nickel, made_once):
+    """Function of an axis, the origin of the lattice and a number of ions: their run."""
 
-    def make(axis, offset):
+    def make(axis, offset, ions=1500):
         tip = ae.Tip(nickel, apex_radius=8 * nickel.a, axis=axis, shank_length=8 * nickel.a, offset_seed=offset)
-        return made_once(tip, 1500, seed=offset, **ROUGH)
+        return made_once(tip, ions, seed=offset, **ROUGH)
 
-    return {
-        name: make(axis, offset)
-        for name, axis, offset in (("right", (1, 1, 1), 1), ("axis", (0, 0, 1), 1), ("measured", (1, 1, 1), 2))
-    }
+    return make
+
+
+@pytest.fixture(scope="module")
+def runs(run_of):
+    """1,500 ions of three tips: two along [111], of different origins of the lattice, and one along [001]."""
+    tips = {"right": ((1, 1, 1), 1), "axis": ((0, 0, 1), 1), "measured": ((1, 1, 1), 2)}
+    return {name: run_of(*tip) for name, tip in tips.items()}
+
+
+@pytest.fixture(scope="module")
+def few(run_of):
+    """700 ions of them."""
+    tips = {"right": ((1, 1, 1), 1), "axis": ((0, 0, 1), 1), "measured": ((1, 1, 1), 2)}
+    return {name: run_of(*tip, 700) for name, tip in tips.items()}
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +53,9 @@ def test_the_tip_and_its_energies_are_found(fit):
     assert fit.shares == {"axis": 0.0, "right": 1.0}
 
 
-def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(fit):
+def test_all_runs_are_compared_in_the_same_region_with_the_same_settings(few):
+    candidates = {name: few[name] for name in ("axis", "right")}
+    fit = fit_tips(candidates, few["measured"].hits(ROLLUP), registration=HERE, bins=32, resamples=2, **GRID)
     first, second = fit.studies.values()
     assert (first.measured.mask == second.measured.mask).all() and first.measured.mask.any()
     assert first.settings == second.settings
@@ -65,6 +78,7 @@ def test_options_of_the_perturbation_are_axes_of_every_study(runs):
     assert fit.studies["right"].optimum.options == {"probability": 1.0}
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_for_each_run_that_json_takes(fit):
     rows = fit.rows()
     assert [row["run"] for row in rows] == fit.order
@@ -75,23 +89,24 @@ def test_the_table_has_a_row_for_each_run_that_json_takes(fit):
     assert repr(fit).startswith("<TipFit: 2 runs, 0 failed; best 'right'")
 
 
-def test_a_single_tip_is_the_study_of_its_own_region(runs, tmp_path):
-    measured = runs["measured"].hits(ROLLUP).map(32)
+def test_a_single_tip_is_the_study_of_its_own_region(few, tmp_path):
+    measured = few["measured"].hits(ROLLUP).map(32)
     path = tmp_path / "right.h5"
-    runs["right"].save(path)
+    few["right"].save(path)
     fit = fit_tips({"right": path}, measured, registration=HERE, resamples=0, **GRID)
-    alone = fit_energies(runs["right"], measured, registration=HERE, resamples=0, **GRID)
+    alone = fit_energies(few["right"], measured, registration=HERE, resamples=0, **GRID)
     region = fit.studies["right"].measured.mask
     assert not (region & ~alone.measured.mask).any()
     assert np.isnan(fit.shares["right"]) and fit.rows()[0]["share"] is None
+    assert fit.order == [fit.best] == ["right"] and repr(fit).startswith("<TipFit: 1 runs, 0 failed; best 'right'")
 
 
-def test_a_run_without_responses_is_reported(runs, nickel):
+def test_a_run_without_responses_is_reported(few, nickel):
     tip = ae.Tip(nickel, apex_radius=6 * nickel.a, shank_length=6 * nickel.a)
     without = ae.Simulation(tip).run(20, responses=False, progress=False)
-    measured = runs["measured"].hits(ROLLUP).map(32)
+    measured = few["measured"].hits(ROLLUP).map(32)
     options = {"registration": HERE, "resamples": 0, **GRID}
-    fit = fit_tips({"without": without, "right": runs["right"]}, measured, **options)
+    fit = fit_tips({"without": without, "right": few["right"]}, measured, **options)
     assert list(fit.studies) == ["right"] and "must have responses" in fit.failed["without"]
     with pytest.raises(ValueError, match="none of 1 runs can be compared; without: run must have responses"):
         fit_tips({"without": without}, measured, **options)

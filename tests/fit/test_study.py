@@ -38,9 +38,15 @@ def run(run20):
 
 
 @pytest.fixture(scope="module")
-def redrawn(run):
-    """The ions of `run` with other random numbers, for tests in which an energy is not found."""
-    return replace(run, seed=2)
+def few(few20):
+    """6,000 of them."""
+    return replace(few20, perturbations=(), flown=())
+
+
+@pytest.fixture(scope="module")
+def redrawn(few):
+    """The ions of `few` with other random numbers, for tests in which an energy is not found."""
+    return replace(few, seed=2)
 
 
 @pytest.fixture(scope="module")
@@ -326,10 +332,10 @@ def test_blur_is_warned_of(run, other):
         assert own.contrast < 0.5 * measured.contrast
 
 
-def test_a_ring_without_hits_has_no_contrast(run, redrawn):
+def test_a_ring_without_hits_has_no_contrast(few, redrawn):
     """Such a simulated map is a result, and the fit goes on."""
     region = seen(redrawn, ROLLUP)
-    measure = PoleMeasure(run, HERE, region, (1, 1, 1))
+    measure = PoleMeasure(few, HERE, region, (1, 1, 1))
     (inner, outer), _ = measure.rings[0]
     frame = pole_frame(region, measure.projection, measure.pole, np.inf)
     empty = region.values.copy()
@@ -340,32 +346,32 @@ def test_a_ring_without_hits_has_no_contrast(run, redrawn):
     assert misfit > np.sqrt(1 / len(found.values)) and np.isfinite(error)  # its difference is 1
 
 
-def test_no_pole_is_no_error(run, redrawn):
+def test_no_pole_is_no_error(few, redrawn):
     """A region too small for rings: the second objective is missing, and the reason is stored."""
     measured = seen(redrawn, ROLLUP)
     x, y = np.meshgrid(EDGES[1:], EDGES[1:])
     small = replace(measured, mask=np.hypot(x - 30, y - 30) < 22)
     options = {"means": (0.1, 0.2), "relative_spreads": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
-    study = fit_energies(run, small, progress=False, **options)
+    study = fit_energies(few, small, progress=False, **options)
     assert study.settings.objective == "similarity"
     assert study.structure is None and "inside the compared region" in study.provenance["structure"]
     assert study.to_dict()["structure"] is None
     with pytest.raises(ValueError, match="no pole has 70% of a ring"):
-        fit_energies(run, small, pole=(1, 1, 1), progress=False, **options)
+        fit_energies(few, small, pole=(1, 1, 1), progress=False, **options)
     with pytest.raises(ValueError, match="objective is 'folded', but the maps show no pole to fold about: no pole has"):
-        fit_energies(run, small, objective="folded", progress=False, **options)
+        fit_energies(few, small, objective="folded", progress=False, **options)
 
 
 # ---- many maps at a time -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("smoothing, flattening", [(0.0, 0.0), (2.5, 0.0), (0.0, 15.0), (3.0, 20.0)])
-def test_what_is_compared_is_what_similarity_compares(run, redrawn, smoothing, flattening):
+def test_what_is_compared_is_what_similarity_compares(few, redrawn, smoothing, flattening):
     x, y = np.meshgrid(EDGES[1:], EDGES[1:])
     measured = replace(seen(redrawn, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
     comparison = Comparison(measured, FitSettings(smoothing=smoothing, flattening=flattening, resamples=0))
-    sampler = Sampler(run, HERE, measured, comparison.box, 0, 0)
-    simulated = replace(seen(run, LATERAL), mask=measured.mask)
+    sampler = Sampler(few, HERE, measured, comparison.box, 0, 0)
+    simulated = replace(seen(few, LATERAL), mask=measured.mask)
     drawn = sampler.map(LATERAL, 1)
     assert drawn.noise is None
     assert np.array_equal(drawn.counts, simulated.counts[comparison.box])
@@ -434,15 +440,15 @@ def test_noise_of_simulated_maps_is_that_of_their_ions(run, other):
 
 @pytest.mark.parametrize(("smoothing", "flattening"), [(0.0, 0.0), (2.5, 15.0)])
 @pytest.mark.parametrize("folded", [False, True])
-def test_resamples_are_maps_with_a_little_noise(run, other, smoothing, flattening, folded):
+def test_resamples_are_maps_with_a_little_noise(few, redrawn, smoothing, flattening, folded):
     """A slow twin: a map for each resample, of which the flattening and the correction stay those of the whole map."""
     x, y = np.meshgrid(EDGES[1:], EDGES[1:])
-    measured = replace(seen(other, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
+    measured = replace(seen(redrawn, ROLLUP), mask=(x**2 + y**2 < 50**2) & (x < 30))
     settings = FitSettings(smoothing=smoothing, flattening=flattening, resamples=5, seed=5)
     cells = np.where(measured.mask, np.hypot(x, y) // 5 * 12 + np.degrees(np.arctan2(y, x)) % 120 // 10, -1).astype(int)
     comparison = FoldedComparison(measured, settings, cells) if folded else Comparison(measured, settings)
     box = comparison.box
-    drawn = Sampler(run, HERE, measured, box, 5, 7).map(LATERAL, 3)
+    drawn = Sampler(few, HERE, measured, box, 5, 7).map(LATERAL, 3)
     values, cells = measured.values[box], cells[box]
     measured_noise = np.random.default_rng((5, 0)).poisson(values, (50, *values.shape)) - values
     correction = comparison.measured_noise + comparison.variance_of(drawn.noise[None], drawn.counts)
@@ -476,12 +482,12 @@ def test_resamples_are_maps_with_a_little_noise(run, other, smoothing, flattenin
     assert found[1:].std() > 1e-3
 
 
-def test_replicas_have_less_noise(run, redrawn):
+def test_replicas_have_less_noise(few, redrawn):
     """Maps of two disjoint sets of draws are the more alike the more draws there are."""
     measured = seen(redrawn, ROLLUP)
-    sampler = Sampler(run, HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
-    again = Sampler(replace(run, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
-    alike, one = [], seen(run, LATERAL).ions
+    sampler = Sampler(few, HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    again = Sampler(replace(few, seed=99), HERE, measured, (slice(0, 48), slice(0, 48)), 0, 0)
+    alike, one = [], seen(few, LATERAL).ions
     for replicas in (1, 4):
         maps = [each.map(LATERAL, replicas).counts.astype(int) for each in (sampler, again)]
         assert maps[0].sum() == pytest.approx(replicas * one, rel=0.05)  # 3 / sqrt(one), rounded up
@@ -670,9 +676,9 @@ def test_a_score_is_corrected_only_above_its_noise_and_its_ceiling(twin):
             assert corrected not in text and plain not in text
 
 
-def test_a_matrix_of_similarities_says_what_the_public_function_says(run, redrawn):
+def test_a_matrix_of_similarities_says_what_the_public_function_says(few, redrawn):
     options = {"means": (0.1, 0.2), "relative_spreads": (1.0,), "registration": HERE, "resamples": 0}
-    study = fit_energies(run, seen(redrawn, ROLLUP), objective="similarity", progress=False, **options)
+    study = fit_energies(few, seen(redrawn, ROLLUP), objective="similarity", progress=False, **options)
     draws = study.maps["optimum"]
     assert float(ae.similarity(study.compared(draws), study.compared(study.measured))) == pytest.approx(
         study.plain["optimum"].value, abs=1e-9
@@ -808,10 +814,10 @@ def test_the_axis_of_the_rollup_fraction(run, other):
     json.dumps(study.to_dict(), allow_nan=False)
 
 
-def test_bins_of_a_map_are_merged(run, redrawn):
+def test_bins_of_a_map_are_merged(few, redrawn):
     measured = seen(redrawn, ROLLUP)
     options = {"means": (0.2,), "relative_spreads": (1.0,), "registration": HERE, "replicas": 1, "resamples": 0}
-    study = fit_energies(run, measured, bins=24, progress=False, **options)
+    study = fit_energies(few, measured, bins=24, progress=False, **options)
     assert study.measured.values.shape == (24, 24)
     assert study.measured.counts[5, 7] == measured.counts[10:12, 14:16].sum()
     assert study.measured.bin_size == (5.0, 5.0)
@@ -831,21 +837,21 @@ def test_gradients_of_the_instrument_do_not_move_the_energies(run, other):
     assert flat.scores.max() > tilted.scores.max()
 
 
-def test_studies_that_cannot_be(run, redrawn):
+def test_studies_that_cannot_be(few, redrawn):
     measured = seen(redrawn, ROLLUP)
     with pytest.raises(ValueError, match="run must have responses"):
-        fit_energies(replace(run, responses=None), measured, registration=HERE)
+        fit_energies(replace(few, responses=None), measured, registration=HERE)
     with pytest.raises(ValueError, match="measured"):
-        fit_energies(run, 3, registration=HERE)
+        fit_energies(few, 3, registration=HERE)
     with pytest.raises(ValueError, match="replicas"):
-        fit_energies(run, measured, registration=HERE, replicas=0)
+        fit_energies(few, measured, registration=HERE, replicas=0)
     with pytest.raises(ValueError, match="smoothing"):
-        fit_energies(run, measured, registration=HERE, smoothing=-1)
+        fit_energies(few, measured, registration=HERE, smoothing=-1)
     with pytest.raises(ValueError, match="the registration must put simulated hits on the measured map"):
-        fit_energies(run, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
+        fit_energies(few, measured, registration=ae.Registration(0.0, 1.0, (1e6, 0.0)))
     with pytest.raises(ValueError, match="must contain a window of 11 bins"):
         small = replace(measured, mask=np.add.outer(np.arange(48), np.arange(48)) < 9)
-        fit_energies(run, small, registration=HERE)
+        fit_energies(few, small, registration=HERE)
 
 
 @pytest.mark.slow

@@ -10,13 +10,23 @@ from apt_evap.specimen.symmetry import point_group
 
 
 @pytest.fixture(scope="module")
-def run(nickel, made_once):
+def run_of(nickel, made_once):
+    """Function of a number of ions: their run."""
     tip = ae.Tip(nickel, 9 * nickel.a, axis=(0.36, 0.52, 0.775), shank_length=12 * nickel.a, offset_seed=1)
     detector = ae.Detector(distance=100.0, width=500.0, projection="equidistant")
     emissions = [ae.LateralVelocity(0.2), ae.RollUp(0.2), ae.Unperturbed()]
-    return made_once(
-        tip, 3_000, emissions, responses=False, seed=1, detector=detector, flight_settings=ROUGH["flight_settings"]
-    )
+    options = {"responses": False, "seed": 1, "detector": detector, "flight_settings": ROUGH["flight_settings"]}
+    return lambda ions: made_once(tip, ions, emissions, **options)
+
+
+@pytest.fixture(scope="module")
+def run(run_of):
+    return run_of(3_000)
+
+
+@pytest.fixture(scope="module")
+def few(run_of):
+    return run_of(1_500)
 
 
 def random_directions(rng, n):
@@ -87,11 +97,11 @@ def test_a_pattern_is_the_direct_sum_over_the_point_group(run):
     assert folded / folded.mean() == pytest.approx(direct / direct.mean(), rel=0.1, abs=0.06)
 
 
-def test_a_saved_pattern_is_read_back(run, tmp_path):
-    pattern = ae.fit.master_pattern([run])
+def test_a_saved_pattern_is_read_back(few, tmp_path):
+    pattern = ae.fit.master_pattern([few])
     pattern.save(tmp_path / "mine.npz")
     again = MasterPattern.load(tmp_path / "mine.npz")
-    assert (again.structure, again.apex_radius, again.ions) == ("fcc", 9.0, 3_000)
+    assert (again.structure, again.apex_radius, again.ions) == ("fcc", 9.0, 1_500)
     # 255 levels of the square root up to 8
     clipped = np.minimum(pattern.densities, 8.0)
     assert np.abs(np.sqrt(again.densities) - np.sqrt(clipped)).max() <= 0.5 * np.sqrt(8) / 255 + 1e-9
@@ -112,12 +122,12 @@ def test_a_map_has_the_ions_and_the_poles_of_its_pattern():
     assert np.array_equal(made.values, pattern.map(orientation, projection, 60.0, ions=200_000, seed=3).values)
 
 
-def test_bad_arguments_are_named(run):
+def test_bad_arguments_are_named(few):
     pattern = master_patterns("fcc")[0]
     with pytest.raises(ValueError, match="sc"):
         master_patterns("sc")
     with pytest.raises(ValueError, match="emissions"):
-        ae.fit.master_pattern(run, [ae.Unperturbed()])
+        ae.fit.master_pattern(few, [ae.Unperturbed()])
     with pytest.raises(ValueError, match="runs"):
         ae.fit.master_pattern([3])
     with pytest.raises(ValueError, match="rolled"):

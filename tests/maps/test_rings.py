@@ -74,6 +74,7 @@ def test_the_error_is_that_of_new_counts(rng):
     assert np.mean([ring.error for ring in rings]) == pytest.approx(scatter, rel=0.5)  # 25 values: 14 %
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_resamples_whose_contrast_has_the_noise_twice(rng):
     """The same with a map for each resample, where the contrast is as small as the noise."""
     edges = np.linspace(-30, 30, 61)

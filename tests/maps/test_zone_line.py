@@ -55,7 +55,7 @@ def test_a_line_that_is_flat_in_its_middle(exponent):
 
 
 @pytest.mark.parametrize("n_fits", [30, pytest.param(300, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("height", [-0.8, 2.0])
+@pytest.mark.parametrize("height", [-0.8, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_errors_of_the_fit_are_those_of_counting(height, n_fits):
     random = np.random.default_rng(5)
     truth = FULL_WIDTH * 2.5

@@ -169,10 +169,10 @@ def balls_of(seed, radius, share, matrix, density):
 @pytest.mark.parametrize(
     ("radius", "share", "matrix", "density", "d_max", "n_min", "bias", "rich"),
     [  # mean differences from the share of 30 other seeds: of these compositions, and of all ions of the clusters
-        (0.8, 0.25, 0.02, 48, 0.5, 12, 0.028, 0.26),
-        (1.0, 0.37, 0.02, 48, 0.5, 18, 0.002, 0.12),
+        pytest.param(0.8, 0.25, 0.02, 48, 0.5, 12, 0.028, 0.26, marks=pytest.mark.slow),
+        pytest.param(1.0, 0.37, 0.02, 48, 0.5, 18, 0.002, 0.12, marks=pytest.mark.slow),
         (0.8, 0.5, 0.02, 30, 0.5, 10, -0.015, 0.15),
-        (0.0, 0.03, 0.03, 48, 0.55, 6, 0.060, 0.57),  # a random alloy
+        pytest.param(0.0, 0.03, 0.03, 48, 0.55, 6, 0.060, 0.57, marks=pytest.mark.slow),  # a random alloy
     ],
 )
 def test_solutes_that_made_a_cluster_do_not_count_in_its_composition(
@@ -239,10 +239,10 @@ def test_sites_of_a_run_and_its_reconstruction():
     core = ae.specimen.Phase("core", "Ni", ae.specimen.Sphere((0, 0, 2.0), 0.8), solutes={"Al": 0.5})
     tip = ae.Tip(phases=[ae.specimen.Phase("matrix", "Ni", solutes={"Al": 0.05}), core], apex_radius=2.5, seed=1)
     run = ae.Simulation(tip, seed=1, flight_settings=ROUGH["flight_settings"]).run(
-        300, [ae.Unperturbed()], responses=False, progress=False
+        200, [ae.Unperturbed()], responses=False, progress=False
     )
     sites = run.sites()
-    assert sites.names == ("Ni", "Al") and len(sites) == 300
+    assert sites.names == ("Ni", "Al") and len(sites) == 200
     assert sites.mark("Al").sum() == sum(run.elements[k] == "Al" for k in run.species)
     assert np.array_equal(sites.positions, run.emissions.positions)
     hits = run.hits(ae.Unperturbed())

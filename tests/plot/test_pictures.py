@@ -460,6 +460,7 @@ def overlapping(texts):
     return [(a, b) for number, a in enumerate(boxes) for b in boxes[:number] if a.overlaps(b)]
 
 
+@pytest.mark.usefixtures("spectra_once")
 def test_labels_of_near_peaks_are_apart_and_those_of_the_largest_are_there(rng):
     peaks = {"H": 1.0, "H2": 2.0, "C": 12.0, "Si": 14.0, "O": 16.0, "OH": 17.0, "H2O": 18.0, "Si+": 28.0, "CO": 28.6}
     number = dict(zip(peaks, (9000, 6000, 150, 40_000, 220, 40, 160, 2500, 30), strict=True))

@@ -7,6 +7,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from source_trees import nodes_of
 
 PACKAGE = Path(__file__).parents[2] / "apt_evap"
 
@@ -39,7 +40,7 @@ def with_line(path, line):
 def imports(source, package):
     """Dotted names, without "apt_evap.", that a source imports, wherever it does: also by name, or for type hints."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         names = []
         if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
             names = [item.value for item in node.args if isinstance(item, ast.Constant)]

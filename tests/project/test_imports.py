@@ -77,8 +77,8 @@ def test_the_test_sees_what_is_loaded():
     ],
     ids=["package", "help", "first map of a run"],
 )
-def test_the_start_is_short(small_tip, tmp_path, code, seconds):
-    """Processor time; the least of five, because other programs make each longer and none shorter."""
-    ae.Simulation(small_tip, seed=1, n_threads=1).run(300, progress=False).save(tmp_path / "run.h5")
+def test_the_start_is_short(small_tip, made_once, tmp_path, code, seconds):
+    """Processor time; one of five will do, because other programs make each longer and none shorter."""
+    made_once(small_tip, 250, voltage=1000.0, seed=2).save(tmp_path / "run.h5")
     code = f"import os\nos.chdir({str(tmp_path)!r})\n{code}\nimport time\nprint(time.process_time())"
-    assert min(float(printed(code).split()[-1]) for _ in range(5)) < seconds
+    assert any(float(printed(code).split()[-1]) < seconds for _ in range(5))

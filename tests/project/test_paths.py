@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from source_trees import nodes_of
 
 import apt_evap as ae
 
@@ -63,7 +64,7 @@ def test_what_a_text_names_exists(path):
     assert missing_files(text, path.parent) == []
     assert missing_names(text) == []
     if path.suffix == ".py":
-        for node in ast.walk(ast.parse(text)):
+        for node in nodes_of(text):
             if isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "apt_evap":
                 for item in node.names:
                     assert exists(f"{node.module}.{item.name}".removeprefix("apt_evap.")), (node.module, item.name)
@@ -78,7 +79,7 @@ NAMES |= {ast.alias: ("name", "asname"), ast.ImportFrom: ("module",)}
 def names_and_texts(path):
     """Names of the code of a file, which words of its texts and comments are not, and its texts."""
     names, texts = set(), []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path.read_text()):
         if type(node) is ast.Constant:
             if isinstance(node.value, str):
                 texts.append(node.value)

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from source_trees import tree_of
 
 import apt_evap as ae
 
@@ -104,7 +105,7 @@ def test_help_shows_aliases_of_types(name):
 def public_functions():
     """Functions and methods without an underscore, with where they are."""
     for path in sorted((ROOT / "apt_evap").rglob("*.py")):
-        holders = [ast.parse(path.read_text())]
+        holders = [tree_of(path.read_text())]
         while holders:
             holder = holders.pop()
             for node in holder.body:

@@ -207,20 +207,21 @@ def test_groups_of_ions(cloud):
     assert errors.to_dict()["by_group"]["groups"] == [-2, 7]
 
 
-def test_groups_are_given_for_the_hits_or_the_run(run20, nickel):
-    hits = run20.hits(ae.Unperturbed())
+def test_groups_are_given_for_the_hits_or_the_run(few20, nickel):
+    hits = few20.hits(ae.Unperturbed())
     known = {"atomic_volume": nickel.a**3 / 4, "distance": 100.0, "detector_radius": 75.0, "radius": 7.0}
     result = ae.reconstruct(hits[:2000], **known, projection="compressed", compression=1.13)
-    height = (run20.emissions.positions[:, 2] > 6.5).astype(int)
-    by_run = result.errors(run20, groups=height).by_group
-    by_hit = result.errors(run20, groups=height[result.hits.ion]).by_group
+    height = (few20.emissions.positions[:, 2] > 6.5).astype(int)
+    by_run = result.errors(few20, groups=height).by_group
+    by_hit = result.errors(few20, groups=height[result.hits.ion]).by_group
     assert by_run.ions.tolist() == by_hit.ions.tolist() and len(by_run.groups) == 2
-    assert result.errors(run20).by_group.groups.tolist() == [0]  # the species
+    assert result.errors(few20).by_group.groups.tolist() == [0]  # the species
     assert result.errors().by_group is None
     with pytest.raises(ValueError, match="groups"):
-        result.errors(run20, groups=[1, 2])
+        result.errors(few20, groups=[1, 2])
 
 
+@pytest.mark.slow
 def test_a_simulated_run_is_compared_with_its_sites(tip12, nickel):
     simulation = ae.Simulation(tip12, seed=3, detector=ae.Detector(distance=100.0, width=300.0))
     run = simulation.run(1200, [ae.Unperturbed()], responses=False, progress=False).at_evaporation_field()

@@ -218,6 +218,7 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
 
 
+@pytest.mark.slow
 def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recession():
     hits, _ = ions_of(voltage=varying())
     places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
@@ -242,6 +243,7 @@ def test_inside_the_field_of_view_the_voltage_finds_fields_and_doubts_the_recess
     assert change[:, 2].std() > 0.001 and plain.recession_changes() == []
 
 
+@pytest.mark.slow
 def test_at_the_rim_the_errors_of_fields_and_voltage_are_those_of_the_recession():
     hits, labels = ions_of(voltage=varying())
     found = evolving(hits, labels=labels)

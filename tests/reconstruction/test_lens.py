@@ -12,7 +12,13 @@ FIELD, VOLUME, EFFICIENCY, LENGTH, SHANK = 35.0, 0.011, 0.5, 90.0, 6.0  # V/nm, 
 RIM = 20.0  # mm
 
 
-@pytest.fixture(scope="module", params=[0.0, 4300.0], ids=["field-free drift", "potential of the detector"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(0.0, id="field-free drift", marks=pytest.mark.slow),
+        pytest.param(4300.0, id="potential of the detector"),
+    ],
+)
 def lens(request):
     return ae.detection.LocalElectrode(40e3, 20e3, SHANK, detector_potential=request.param)
 

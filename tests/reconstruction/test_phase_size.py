@@ -11,7 +11,7 @@ EXACT = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
 
 
 def test_a_ball_has_its_size_and_the_constants_its_errors():
-    n = 20_000
+    n = 10_000
     directions = even_flux(n, 0.54)
     voltage = 3000.0 + 10 * np.sin(np.arange(n) / 300)
     hits = ae.Hits(

@@ -127,9 +127,9 @@ def test_an_efficiency_changes_the_depth_only(cone):
     whole = ae.reconstruct(cone, **KNOWN, radius=30.0)
     scaled = ae.reconstruct(cone, **KNOWN, radius=30.0, efficiency=0.4)
     assert np.array_equal(scaled.positions[:, :2], whole.positions[:, :2])
-    assert scaled.depths * 0.4 == pytest.approx(whole.depths, abs=1e-9)
+    np.testing.assert_allclose(scaled.depths * 0.4, whole.depths, rtol=0, atol=1e-9, equal_nan=False)
     third = ae.reconstruct(cone[::3], **KNOWN, radius=30.0, efficiency=1 / 3)
-    assert third.positions == pytest.approx(whole.positions[::3], abs=1e-9)
+    np.testing.assert_allclose(third.positions, whole.positions[::3], rtol=0, atol=1e-9, equal_nan=False)
 
 
 def test_a_random_third_of_the_ions(cone, rng):
@@ -142,7 +142,7 @@ def test_a_random_third_of_the_ions(cone, rng):
     assert np.abs(third.radii / whole.radii[chosen] - 1).max() < SLOPE * scatter / 30
 
 
-@pytest.mark.parametrize("protocol", ["cap", "bas"])
+@pytest.mark.parametrize("protocol", ["cap", pytest.param("bas", marks=pytest.mark.slow)])
 def test_the_voltage_of_a_cone_gives_the_shank(cone, protocol):
     shank = ae.reconstruct(cone, **SHANK, protocol=protocol)
     # the same cone ion by ion, the volume of a thin slice at a time
@@ -156,7 +156,7 @@ def test_the_voltage_of_a_cone_gives_the_shank(cone, protocol):
     hits = ae.Hits(x=cone.x, y=cone.y, voltage=voltages / 1.2, pulse_voltage=voltages / 6)
     by_voltage = ae.reconstruct(hits, **KNOWN, evaporation_field=FIELD, protocol=protocol)
     # thin slices are exact to dR / R per ion: 1e-6; 0.5 % of the depth is what a reconstruction needs
-    assert by_voltage.radii == pytest.approx(shank.radii, rel=1e-5)
+    np.testing.assert_allclose(by_voltage.radii, shank.radii, rtol=1e-5, equal_nan=False)
     assert by_voltage.depths[-1] == pytest.approx(shank.depths[-1], rel=1e-5)
     assert np.abs(by_voltage.positions - shank.positions).max() < 0.005 * shank.depths[-1]
     assert shank.radii[-1] - shank.radii[0] == pytest.approx(SLOPE * shank.depths[-1])

@@ -43,10 +43,10 @@ def numpy_dispatch():
     "variant",
     [
         {},
-        {"OPENBLAS_CORETYPE": "Nehalem"},
-        {"OPENBLAS_CORETYPE": "Haswell"},
+        pytest.param({"OPENBLAS_CORETYPE": "Nehalem"}, marks=pytest.mark.slow),
+        pytest.param({"OPENBLAS_CORETYPE": "Haswell"}, marks=pytest.mark.slow),
         {"NPY_DISABLE_CPU_FEATURES": "all"},
-        {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-FMA,-FMA4,-AVX512F"},
+        pytest.param({"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX,-AVX2,-FMA,-FMA4,-AVX512F"}, marks=pytest.mark.slow),
     ],
     ids=lambda variant: "".join(variant) or "as it is",
 )

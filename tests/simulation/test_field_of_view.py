@@ -94,6 +94,7 @@ def test_scouts_are_among_the_launches_of_the_responses(every_ion):
     assert np.abs((scouts.velocities * emissions.normals[:, None]).sum(axis=2)).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_the_prediction_is_needed(tips, every_ion, monkeypatch):
     """Without it, with the flight at rest from the site alone and no margin, ions are lost."""
 
@@ -125,6 +126,7 @@ def test_the_margin_follows_the_energy_limit(tips, energy_limit):
             np.testing.assert_array_equal(part.hits(perturbation).detected, inside)
 
 
+@pytest.mark.slow
 def test_a_smaller_energy_limit_flies_fewer_ions(tips):
     low, high = (
         simulate(tips["nickel"], 200, 20.0, response_settings=ae.ResponseSettings(energy_limit=limit))
@@ -138,21 +140,21 @@ def test_a_smaller_energy_limit_flies_fewer_ions(tips):
 
 def test_bits_do_not_depend_on_threads_batches_and_interruptions(tips, tmp_path):
     settings = {"flight_settings": ae.simulation.FlightSettings(field_of_view=20.0), "detector": DETECTOR, "seed": 1}
-    one = ae.Simulation(tips["alloy"], n_threads=1, **settings).run(150, progress=False)
-    two = ae.Simulation(tips["alloy"], n_threads=2, **settings).run(150, progress=False, batch_size=17)
+    one = ae.Simulation(tips["alloy"], n_threads=1, **settings).run(60, progress=False)
+    two = ae.Simulation(tips["alloy"], n_threads=2, **settings).run(60, progress=False, batch_size=17)
     path = tmp_path / "run.h5"
-    ae.Simulation(tips["alloy"], **settings).run(60, progress=False, checkpoint=path)
+    ae.Simulation(tips["alloy"], **settings).run(25, progress=False, checkpoint=path)
     resumed = ae.Simulation(tips["alloy"], **settings).run(
-        150, progress=False, checkpoint=ae.simulation.Checkpoint(path, resume=True)
+        60, progress=False, checkpoint=ae.simulation.Checkpoint(path, resume=True)
     )
-    assert 0 < one.not_flown.sum() < 150
+    assert 0 < one.not_flown.sum() < 60
     for run in (two, resumed, ae.load(path)):
         assert run.fingerprint() == one.fingerprint()
         np.testing.assert_array_equal(run.not_flown, one.not_flown)
         assert run.field_of_view == 20.0
     with pytest.raises(ae.FileError, match="flights"):
         settings["flight_settings"] = ae.simulation.FlightSettings(field_of_view=25.0)
-        ae.Simulation(tips["alloy"], **settings).run(200, checkpoint=ae.simulation.Checkpoint(path, resume=True))
+        ae.Simulation(tips["alloy"], **settings).run(80, checkpoint=ae.simulation.Checkpoint(path, resume=True))
 
 
 def test_ions_are_counted(part_of_view):
@@ -166,6 +168,7 @@ def test_ions_are_counted(part_of_view):
     assert f"{summary['not_flown']} ions not flown" in repr(part_of_view)
 
 
+@pytest.mark.slow
 def test_perturbations_with_their_own_flights_are_flown_for_all_ions(tips):
     perturbations = (ae.Unperturbed(), ae.RollUp(0.5))
     run = ae.Simulation(

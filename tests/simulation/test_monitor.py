@@ -122,6 +122,7 @@ def warned(tip, **options):
     return [(item.category, str(item.message)) for item in caught]
 
 
+@pytest.mark.slow
 def test_one_warning_past_each_bound(small_tip):
     assert warned(small_tip) == []
     ((kind, text),) = warned(small_tip, monitor={"charge_bound": 1e-6})

@@ -131,13 +131,13 @@ def test_what_is_no_parts_is_refused(parts, message):
         Run.join(parts)
 
 
-def test_masked_rows_are_refused(run20):
+def test_masked_rows_are_refused(few20):
     """As by `Hits`: a row that is masked is neither selected nor left out."""
-    mask = np.arange(len(run20)) % 2 == 0
+    mask = np.arange(len(few20)) % 2 == 0
     for rows in (np.ma.array(~mask, mask=mask), np.ma.array(np.arange(3), mask=[False, True, False])):
         with pytest.raises(ValueError, match="rows"):
-            run20[rows]
-    assert len(run20[np.ma.array(mask)]) == mask.sum()
+            few20[rows]
+    assert len(few20[np.ma.array(mask)]) == mask.sum()
 
 
 def bits_of(run):
@@ -179,17 +179,17 @@ def test_ions_of_packed_parts_take_less_than_0_7_kilobytes(run):
     assert size < 700 < 1400 < whole
 
 
-def test_packed_parts_are_joined_without_a_second_copy(run20):
+def test_packed_parts_are_joined_without_a_second_copy(few20):
     """Joining needs the memory of the run, beside that of the packed parts, which is not traced."""
-    whole = sum(values.nbytes for values in columns_of(run20, run20.every_column).values())
+    whole = sum(values.nbytes for values in columns_of(few20, few20.every_column).values())
     peaks = []
     for last in (True, False):
         packed = PackedParts()
-        for start in range(0, len(run20), 1500):
-            packed.add(run20[start : start + 1500])
+        for start in range(0, len(few20), 1500):
+            packed.add(few20[start : start + 1500])
         tracemalloc.start()
         packed.run(last=last)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        assert len(packed) == (0 if last else len(run20))
+        assert len(packed) == (0 if last else len(few20))
     assert max(peaks) < 1.3 * whole

@@ -178,6 +178,7 @@ def test_responses_say_where_ions_land(run, perturbation):
     assert np.median(times) < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::apt_evap.warnings.ResponseWarning")  # a few energies are above the limit
 def test_higher_degree_is_better(tip12):
     """What the polynomials leave over shrinks with their degree."""

@@ -20,7 +20,7 @@ apex_radius = "6 a"
 shank_length = "6 a"
 
 [simulation]
-ions = 150
+ions = 60
 
 [maps]
 bins = 24
@@ -95,7 +95,7 @@ def test_the_index_has_all_points(sweep, collected):
     assert [row["key"] for row in rows] == list(sweep.keys)
     assert [row["state"] for row in rows] == ["done", "waiting", "done", "done", "done"]
     run = ae.load(sweep.folder_of(rows[2]["key"]) / "run.h5")
-    assert rows[2]["fingerprint"] == run.fingerprint() and rows[2]["ions"] == "150"
+    assert rows[2]["fingerprint"] == run.fingerprint() and rows[2]["ions"] == "60"
     assert rows[2]["tip.axis"] == "[1, 1, 1]" and rows[1]["fingerprint"] == ""
     assert rows[4]["detector.width"] == "200.0" and rows[0]["detector.width"] == ""
 
@@ -127,7 +127,7 @@ def test_status_corrects_the_hours_by_those_of_finished_points(sweep):
 @pytest.mark.slow
 def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
     """From the study file to the table. The search for the registration is that of `fit_energies`, tested there."""
-    planned(tmp_path, STUDY, BASE.replace("150", "400"))
+    planned(tmp_path, STUDY, BASE.replace("60", "400"))
     sweep = open_sweep(tmp_path / "study.toml")
     measured = do(sweep, sweep.keys[2])  # of another origin than that of the point
     hits = measured.hits(ROLLUP)
@@ -137,7 +137,7 @@ def test_a_sweep_finds_the_tip_of_a_measured_map(tmp_path, capsys, monkeypatch):
         "resamples = 10, replicas = 4, select = {mass_to_charge = [0.0, 100.0]}}\n"
     )
     study = compare + '"base" = "base.toml"\n[sweep]\n"tip.axis" = [[0, 0, 1], [1, 1, 1]]\n"tip.offset_seed" = [1]\n'
-    sweep = planned(tmp_path, study, BASE.replace("150", "400"))
+    sweep = planned(tmp_path, study, BASE.replace("60", "400"))
     do(sweep, sweep.keys[0])
     known = ae.Registration(0.0, 1.0, (0.0, 0.0))
     fit_tips = collection_module.fit_tips

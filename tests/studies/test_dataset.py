@@ -134,6 +134,7 @@ def test_the_same_bytes_in_another_folder_and_after_a_second_time(made, tmp_path
     assert times == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "set").glob("*.h5")}
 
 
+@pytest.mark.slow
 def test_missing_files_are_made_again(made, tmp_path):
     plan = planned(tmp_path)
     make_dataset(plan, tmp_path / "set")
@@ -285,6 +286,7 @@ def test_tables_and_parts(made):
     assert len(data[0].hits.map(bins=16).values) == 16
 
 
+@pytest.mark.slow
 def test_only_the_chosen_fields(tmp_path):
     plan = planned(tmp_path, STUDY + 'fields = ["y", "x", "poles"]\n')
     make_dataset(plan, tmp_path / "set")
@@ -578,6 +580,7 @@ def test_a_link_in_a_set_is_not_written_through(tmp_path):
     assert (tmp_path / "mine").read_text() == "mine"
 
 
+@pytest.mark.slow
 def test_a_damaged_file_of_an_unfinished_set_gets_no_new_checksum(made, tmp_path):
     plan = planned(tmp_path)
     make_dataset(plan, tmp_path / "set")
@@ -650,7 +653,7 @@ def test_a_file_in_the_place_of_a_new_one_is_not_replaced(made, tmp_path):
         ("draws = 2", 'draws = 2\nfields = ["x"]', "dataset.fields"),
     ],
 )
-@pytest.mark.parametrize("is_finished", [True, False])
+@pytest.mark.parametrize("is_finished", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_set_of_another_study_is_not_replaced(made, tmp_path, old, new, word, is_finished):
     folder = replaced(tmp_path / "set", made[1])
     if not is_finished:
@@ -693,6 +696,7 @@ def test_runs_that_a_disk_has_ended_are_made_again(made, tmp_path, monkeypatch, 
     check_same(made[1], tmp_path / "set")
 
 
+@pytest.mark.slow
 def test_runs_of_another_process_are_waited_for(made, tmp_path, monkeypatch):
     plan = planned(tmp_path)
     key = plan.sweep.keys[0]

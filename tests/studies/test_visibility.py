@@ -94,6 +94,7 @@ def test_equal_fields_without_energies_leave_binomial_scatter(operators):
     assert scatter == pytest.approx(1.0, abs=4 * math.sqrt(2 / twins))
 
 
+@pytest.mark.slow
 def test_permuted_labels_have_uniform_p_values(operators):
     random = np.random.default_rng(4)
     ions = operators.emulate(1, size=0.8)
@@ -202,20 +203,28 @@ def test_a_foreign_file_has_no_operators(tmp_path):
     ("change", "name"),
     [
         ({"feature": particle(0.8, fraction=0.02)}, "feature.solutes"),
-        ({"feature": particle(0.8, ratio=1.1)}, "feature.evaporation_field"),
-        ({"feature": replace(particle(0.8), region=ae.specimen.Sphere((0, 0, 1.0), 0.8))}, "feature.region.centre"),
-        ({"feature": replace(particle(0.8), solutes={"Cu": 0.5})}, "feature.solutes"),
+        pytest.param({"feature": particle(0.8, ratio=1.1)}, "feature.evaporation_field", marks=pytest.mark.slow),
+        pytest.param(
+            {"feature": replace(particle(0.8), region=ae.specimen.Sphere((0, 0, 1.0), 0.8))}, "feature.region.centre",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"feature": replace(particle(0.8), solutes={"Cu": 0.5})}, "feature.solutes", marks=pytest.mark.slow
+        ),
         ({"instrument": ae.Instrument(field_of_view=150.0)}, "instrument.field_of_view"),
-        ({"instrument": ae.Instrument(field_of_view=160.0, resolution=0.5)}, "instrument.resolution"),
+        pytest.param(
+            {"instrument": ae.Instrument(field_of_view=160.0, resolution=0.5)}, "instrument.resolution",
+            marks=pytest.mark.slow,
+        ),
         ({"perturbation": ae.RollUp(0.2)}, "perturbation"),
-        ({"law": ae.Arrhenius(50.0)}, "simulation.law"),
+        pytest.param({"law": ae.Arrhenius(50.0)}, "simulation.law", marks=pytest.mark.slow),
         ({"rule": ae.ConstantPotential()}, "simulation.rule"),
-        ({"voltage": 900.0}, "simulation.voltage"),
-        ({"detector": ae.Detector(distance=90.0)}, "simulation.detector"),
+        pytest.param({"voltage": 900.0}, "simulation.voltage", marks=pytest.mark.slow),
+        pytest.param({"detector": ae.Detector(distance=90.0)}, "simulation.detector", marks=pytest.mark.slow),
         ({"specimen": ae.Tip("Ni", apex_radius=RADIUS, axis=(1, 1, 1), solutes={"Al": 0.05}, seed=1)}, "specimen"),
         ({"sizes": [0.5, 0.8]}, "axes.size"),
     ],
-)
+)  # fmt: skip
 def test_operators_of_something_else_are_refused(tip, operators, tmp_path, change, name):
     """Kept in a file: what was counted for one feature, specimen and instrument is not the answer for another."""
     operators.save(tmp_path / "operators.h5")
@@ -280,7 +289,10 @@ def test_permuted_labels_without_a_number_are_an_error():
         permutation_p_value(unstable, places, labels)
 
 
-@pytest.mark.parametrize(("permutations", "significance"), [(18, 0.05), (98, 0.01), (1, 0.3)])
+@pytest.mark.parametrize(
+    ("permutations", "significance"),
+    [(18, 0.05), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((98, 0.01), (1, 0.3)))],
+)
 def test_a_significance_that_no_p_value_reaches_is_refused(tip, operators, permutations, significance):
     def estimate(permutations):
         return ae.studies.estimate_visibility(

@@ -71,6 +71,7 @@ def before(folder):
     return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
 
 
+@pytest.mark.slow
 def test_two_points_by_two_processes(tmp_path):
     sweep = planned(tmp_path, TWO, SMALL)
     assert {state.name for state in run_sweep(sweep, workers=2).values()} == {"done"}
