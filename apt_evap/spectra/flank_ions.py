@@ -244,7 +244,17 @@ class FlankFit:
 class _Group:
     """Poisson likelihood of ions of one shape in a window, with others and the background."""
 
-    def __init__(self, peaks, bases, lines, weights, window, columns, sure, size) -> None:
+    def __init__(
+        self,
+        peaks: PeakContents,
+        bases: Floats,
+        lines: Sequence[tuple[Floats, Floats]],
+        weights: Floats,
+        window: tuple[int, int],
+        columns: Floats,
+        sure: Floats,
+        size: float,
+    ) -> None:
         self._bases = bases
         self.peaks, self.lines, self.weights, self.columns, self.size = peaks, lines, weights, columns, size
         self.low, self.high = window
@@ -261,7 +271,7 @@ class _Group:
         self._start = self._expected.copy()
         self._fits: dict[frozenset[int], tuple] = {}
 
-    def flanks(self, main, costs, company):
+    def flanks(self, main: Ion, costs: Mapping[Ion, float], company: Sequence[float]) -> tuple[list[Flank], Floats]:
         """Those of `main`, by fits with and without each, beside a company of other ions."""
         self._tried = tried = len(costs) + 1
         self._start[tried : self.number] = company
@@ -269,7 +279,7 @@ class _Group:
         p, best, expected, hessian = self._best(every)
         clear = expected > 1
         rest = float(((self.counts - expected)[clear] ** 2 / expected[clear]).sum())
-        misfit = max(rest / max(np.count_nonzero(clear) - len(p), 1), 1.0)
+        misfit = float(max(rest / max(int(np.count_nonzero(clear)) - len(p), 1), 1.0))
         variance = misfit * np.diag(np.linalg.inv(hessian))[1:tried] * self.size**2
         more = np.array([self._tails_below(at, p) for at in sorted(every)]) ** 2
         gain = np.zeros(len(variance))

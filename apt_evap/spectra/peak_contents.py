@@ -15,8 +15,7 @@ _CORE = 0.75
 the tail. Measured with four made peaks of 100,000 ions, three seeds, as the largest difference of sums of ions: 3.2,
 2.6, 2.0, 1.3, 0.9, 3.1 and 4.6 % of a peak for 0.5, 0.6, 0.7, 0.75, 0.8, 0.9 and 1. Compositions did not judge 0.8."""
 _LONGEST = 0.016
-"""Length in ln m/n at 30 Da of the longest tail. Where 25 standard deviations are more, the last one has this length: of 40
-made spectra of materials with 12 % of the ions in tails of 0.012, elements given, the median L1 falls from 1.0 to 0.3."""
+"""Length in ln m/n at 30 Da of the longest tail, also where 25 standard deviations are more."""
 _TAILS_BEFORE = (2.0, 8.0)  # lengths of tails to low masses
 _MIXTURE = ((0.4, 0.25, 0.15, 0.1, 0.04, 0.02), (0.03, 0.01))  # of the tails, at the start
 _STRONG = 3000  # ions of a peak that has a mixture of tails of its own
@@ -94,9 +93,9 @@ class PeakContents:
         self.seen_at = self.scale.mass(self.places) if len(self.places) else np.zeros(0)
         """m/n of the peaks [Da]."""
         longest = _LONGEST / float(self.scale.sigma(30.0))
-        self.tails = [length for length in _TAILS if length < 0.7 * longest]
-        if len(self.tails) < len(_TAILS):
-            self.tails.append(min(longest, _TAILS[-1]))
+        self.tails = [length for length in _TAILS if length < longest]
+        if len(self.tails) < len(_TAILS) and longest > 1.5 * self.tails[-1]:
+            self.tails.append(longest)
         """Lengths of the tails to high masses."""
         self.left = _LONG if self.scale.mirrored else _SHORT
         self.bases = self.bases_of(_CORE)
