@@ -1,6 +1,6 @@
 """Composition of spectra whose truth is known, failures first: the numbers of docs/composition.rst.
 
-    python benchmarks/composition.py [controls] [random] [hydrides] [hydrogen] [coverage] [time]
+    python benchmarks/composition.py [controls] [random] [hydrides] [materials] [hydrogen] [coverage] [time]
 
 Controls need the package rangefinder (pip install rangefinder); its own composition is printed beside. Costs and rules
 of the choice were set on random specimens of the seeds 5, 11, 2026, 31415, 577 and 811, peaks in flanks on 202701 and
@@ -159,22 +159,40 @@ def random(seed=505202, number=25):
     """Specimens of random elements: distances, invented elements, and what was wrong without a word."""
     rng = np.random.default_rng(seed)
     for kind in KINDS:
-        judge(rng, kind, number)
+        judge(kind[0], specimens(rng, kind, number))
 
 
 def hydrides(seed=505201, number=25):
     """The same with hydrides and pairs, elements given, in sharp peaks, of few ions, and in broad peaks."""
     for at in (0, 2, 3):
-        judge(np.random.default_rng([seed, at + 5]), KINDS[at], number, (False,), with_hydrides)
+        rng = np.random.default_rng([seed, at + 5])
+        judge(KINDS[at][0], specimens(rng, KINDS[at], number, with_hydrides), (False,))
 
 
-def judge(rng, kind, number, blinds=(True, False), change=lambda rng, ions: ions):
-    """Distances of specimens of one kind from the truth."""
+def specimens(rng, kind, number, change=lambda rng, ions: ions):
+    """Names, ions, m/n and drawn ions of specimens of one kind."""
     kind, ions_number, width, tail = kind
-    rows = {blind: [] for blind in blinds}
     for at in range(number):
         ions = change(rng, specimen(rng, kind))
-        expected, (mass, drawn) = truth(ions), draw(rng, ions, ions_number, width, tail)
+        yield at, ions, *draw(rng, ions, ions_number, width, tail)
+
+
+def materials(seed=606301):
+    """Spectra of materials with peaks of three kinds, a million ions each."""
+    from material_spectra import MATERIALS, SHAPES, ions_of
+    from material_spectra import draw as draw_material
+
+    rng = np.random.default_rng(seed)
+    for shape in SHAPES:
+        every = ((name, ions_of(name)) for name in MATERIALS)
+        judge(shape, ((name, ions, *draw_material(rng, ions, 1_000_000, shape)) for name, ions in every))
+
+
+def judge(kind, specimens, blinds=(True, False)):
+    """Distances of specimens of one kind from the truth."""
+    rows = {blind: [] for blind in blinds}
+    for at, ions, mass, drawn in specimens:
+        expected, ions_number = truth(ions), sum(drawn.values())
         for blind in blinds:
             result, seconds = spectrum_of(mass, None if blind else sorted(expected))
             found = result.composition.at_percent
@@ -198,7 +216,7 @@ def judge(rng, kind, number, blinds=(True, False), change=lambda rng, ions: ions
         print(
             f"{kind}, {'blind' if blind else 'given'}: L1 median {np.nanmedian(distance):.2f}, 80 % "
             f"{np.nanquantile(distance, 0.8):.2f}, largest {np.nanmax(distance):.1f} at.%; {int(refused.sum())} "
-            f"without a composition; invented elements in {int((invented > 0).sum())} of {number}, at most "
+            f"without a composition; invented elements in {int((invented > 0).sum())} of {len(values)}, at most "
             f"{invented.max():.2f} at.%; {silent} wrong by > 1 with < 0.5 % unexplained; of "
             f"{shares[refused == 0].sum():.0f} shares {np.nansum(by_error):.0f} outside two errors, "
             f"{np.nansum(by_span):.0f} also outside the span; {seconds.mean():.2f} s",
@@ -291,6 +309,7 @@ if __name__ == "__main__":
         "controls": controls,
         "random": random,
         "hydrides": hydrides,
+        "materials": materials,
         "hydrogen": hydrogen,
         "coverage": coverage,
         "time": times,

@@ -133,7 +133,8 @@ class Amounts:
                 low, high = span.get(element, (0.0, 0.0))
                 span[element] = [min(low, value), max(high, value)]
                 if element not in share and value > high:
-                    errors[element] = other_errors[element]
+                    # where only the sum of two ions is known, the errors of both are larger than it
+                    errors[element] = min(other_errors[element], value)
                 change = abs(value - share.get(element, 0.0))
                 # of an element that they do not change, others say nothing: they would make its error smaller
                 if change > _NO_CHANGE * errors[element]:

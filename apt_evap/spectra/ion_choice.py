@@ -23,6 +23,7 @@ _PAIR = 40.0
 with three charges."""
 _NO_ATOMS = 60.0  # of an element without an atomic ion
 _HEAVY_GASES, _NO_GAS = ("C", "N", "O"), 20.0  # cost of one of these without an atomic ion; H is often in hydrides only
+_WATER = {"OH", "H2O", "H3O"}  # of the residual gas: they show oxygen as its atomic ions do
 UNNAMED = 40.0
 """Cost of a peak without a name: so no name may cost more, and peaks without a name bring no wrong ions."""
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
@@ -87,7 +88,7 @@ class IonChoice:
         self._known = 0
         self._tried: dict[object, Rows] = {}
         self.atoms = np.zeros((0, len(self.elements)))
-        self._charge = self._atomic = self._unusual = np.zeros(0)
+        self._charge = self._atomic = self._shown = self._unusual = np.zeros(0)
         self._learn()
 
     # ---- ions and their costs --------------------------------------------------------------------------------------
@@ -99,6 +100,7 @@ class IonChoice:
             return
         atoms = np.zeros((len(new), len(self.elements)))
         atomic, unusual, charge = np.full(len(new), -1), np.zeros(len(new)), np.zeros(len(new), int)
+        shown = atomic.copy()  # the element of an atomic ion, and oxygen of water
         for at, ion in enumerate(new):
             if ion is None:
                 continue
@@ -107,11 +109,14 @@ class IonChoice:
                 atoms[at, self._place[name]] = number
             charge[at] = ion.charge
             if sum(counts.values()) == 1:
-                atomic[at] = self._place[next(iter(counts))]
+                atomic[at] = shown[at] = self._place[next(iter(counts))]
+            elif ion.formula in _WATER:
+                shown[at] = self._place["O"]
             unusual[at] = unusual_cost(ion)
         self.atoms = np.vstack([self.atoms, atoms])
         self._charge = np.concatenate([self._charge, charge]).astype(int)
         self._atomic = np.concatenate([self._atomic, atomic]).astype(int)
+        self._shown = np.concatenate([self._shown, shown]).astype(int)
         self._unusual = np.concatenate([self._unusual, unusual])
         self._known = len(self.fit.ions)
 
@@ -138,11 +143,11 @@ class IonChoice:
         return float(cost + _UNUSUAL * self._lonely(numbers))
 
     def _present(self, numbers):
-        """Elements of some ions, and those with atomic ions."""
+        """Elements of some ions, and those with atomic ions, or oxygen with water."""
         present = self.atoms[numbers].any(0) if len(numbers) else np.zeros(len(self.elements), bool)
         single = np.zeros(len(self.elements), bool)
-        atomic = self._atomic[numbers] if len(numbers) else np.zeros(0, int)
-        single[atomic[atomic >= 0]] = True
+        shown = self._shown[numbers] if len(numbers) else np.zeros(0, int)
+        single[shown[shown >= 0]] = True
         return present, single
 
     def _lonely(self, numbers):
@@ -155,11 +160,11 @@ class IonChoice:
         chosen = np.asarray(chosen, int)
         present, single = self._present(chosen)
         atoms, atomic, charge = self.atoms[numbers] > 0, self._atomic[numbers], self._charge[numbers]
-        is_atom = atomic >= 0
-        element = np.maximum(atomic, 0)
+        is_atom, shows = atomic >= 0, self._shown[numbers] >= 0
+        element = np.maximum(self._shown[numbers], 0)
         cost = self._ion_costs(numbers) + atoms @ np.where(present, 0.0, self._new)
-        cost += np.where(is_atom, 0.0, atoms @ np.where(present, 0.0, self._no_atoms))
-        cost -= np.where(is_atom & present[element] & ~single[element], self._no_atoms[element], 0.0)
+        cost += np.where(shows, 0.0, atoms @ np.where(present, 0.0, self._no_atoms))
+        cost -= np.where(shows & present[element] & ~single[element], self._no_atoms[element], 0.0)
         pairs = {(int(self._atomic[n]), int(self._charge[n])) for n in chosen if self._atomic[n] >= 0}
         for at in np.flatnonzero(is_atom):
             key = int(atomic[at])

@@ -72,6 +72,14 @@ def test_an_isotope_without_a_name_brings_its_ion():
     assert distance(result.composition, truth(ions)) < 4
 
 
+def test_water_shows_oxygen_without_its_atomic_ion():
+    """Of an element without an atomic ion H2O+ cost more than a peak without a name, and O was 0."""
+    ions = {("Fe", 2): 60, ("Fe", 1): 4, ("Ni", 2): 10, ("H", 1): 2, ("H2O", 1): 0.5}
+    result = ae.spectrum(made(ions, 150_000), list(truth(ions)))
+    assert {ion.name for ion in result.ions} == {ion_name(*ion) for ion in ions}
+    assert distance(result.composition, truth(ions)) < 0.6
+
+
 def test_long_tails_are_not_hydrides():
     """12 % of the ions in tails of 0.012: H 3.7 and L1 3.4 with tails of at most ten standard deviations, now 0.1."""
     ions = {("Fe", 2): 80, ("Fe", 1): 1, ("Cr", 2): 13, ("Ni", 2): 5, ("H", 1): 2, ("Cu", 1): 1}
@@ -414,6 +422,16 @@ def test_errors_follow_from_counting():
     molecules = Amounts([{"A": 1, "O": 2}], np.array([50.0]), np.array([[50.0]])).composition(0.0)
     assert molecules["O"] == pytest.approx(200 / 3) and molecules.error["O"] == pytest.approx(0, abs=1e-9)
     assert Amounts([{"A": 1}], np.array([1.0]), np.eye(1)).composition(0.101).refused
+
+
+def test_an_element_of_other_names_has_no_error_above_all_of_it():
+    """F+ beside H3O+ of the same peak: only the sum is known; it was "perhaps F: 0 to 0.47, ± 31.7"."""
+    ions, sums = np.array([900.0, 50.0, 50.0]), np.array([[900.0, 0, 0], [0, 1e8, -1e8], [0, -1e8, 1e8]])
+    other = [{"A": 1}, {"B": 1}, {"F": 1}], ions, sums, 0.0
+    named = [{"A": 1}, {"B": 1}], np.array([900.0, 100.0]), np.diag([900.0, 100.0])
+    composition = Amounts(*named, [other]).composition(0.0)
+    assert composition.span["F"] == pytest.approx((0, 5))
+    assert 5 <= composition.error["F"] < 8
 
 
 def test_other_names_are_in_the_error_by_their_likelihood():
