@@ -139,6 +139,13 @@ def read_text(path: AnyPath, what: str, at_most: int = _MAX_BYTES) -> str:
         return data.decode("latin-1")
 
 
+def plain_float(text: str) -> float:
+    """Number in a cell, as NumPy reads it; ValueError also for 1_0 and digits of other scripts, which `float` takes."""
+    if "_" in text or not text.isascii():
+        raise ValueError(f"no number: {text!r:.60}")
+    return float(text)
+
+
 def read_numbers(path: AnyPath, what: str, names: Sequence[str], at_most: int = _MAX_BYTES) -> dict[str, Floats]:
     """Read a text table of numbers, one row per line, separated by spaces, tabulators, semicolons or commas.
 
@@ -151,7 +158,7 @@ def read_numbers(path: AnyPath, what: str, names: Sequence[str], at_most: int = 
         if cells == [""] or cells[0].startswith("#"):
             continue
         try:
-            row = [float(cell) for cell in cells]
+            row = [plain_float(cell) for cell in cells]
         except ValueError:
             row = []
         if len(row) != len(names) or not all(map(math.isfinite, row)):

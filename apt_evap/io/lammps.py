@@ -16,7 +16,7 @@ import numpy as np
 from apt_evap._common.files import FileError
 from apt_evap._common.types import AnyPath, Booleans, Floats
 from apt_evap._common.validation import check_choice, short_text
-from apt_evap.io._texts import ELEMENTS, read_text
+from apt_evap.io._texts import ELEMENTS, plain_float, read_text
 
 _MAX_BYTES = 1 << 32
 _SAMPLE = 200  # rows that show how many columns there are
@@ -292,7 +292,7 @@ def _usual_width(rows):
 def _is_atom(cells, widths, of_numbers):
     """Whether a row has as many columns, and finite numbers in some of them."""
     try:
-        return len(cells) in widths and all(np.isfinite(float(cells[k])) for k in of_numbers)
+        return len(cells) in widths and all(np.isfinite(plain_float(cells[k])) for k in of_numbers)
     except ValueError:
         return False
 

@@ -125,7 +125,7 @@ def _text(data, n_lines, path, partial):
                 raise _truncated(path, len(rows))
             break
         try:
-            if len(cells) != width:
+            if len(cells) != width or b"_" in line:  # Python takes 1_0 for a number
                 raise ValueError(f"{len(cells)} values")
             values = [float(cell) for cell in cells]
             if not all(_fits(value, kind) for value, kind in zip(values, ("u4", "i2", "u4"), strict=False)):

@@ -129,6 +129,7 @@ def test_types_without_a_name_are_refused(save):
         ("id type x", "id kind x", "no column type, typelabel or element"),
         ("\n2 1 ", "\n2 1 red ", "line 11: expected 5 columns with finite coordinates of an atom, got '2 1 r"),
         ("\n2 1 ", "\n2 1 nan ", "line 11: expected 5 columns with finite coordinates of an atom, got '2 1 n"),
+        ("\n2 1 ", "\n2 1 1_0 ", "line 11: expected 5 columns with finite coordinates of an atom, got '2 1 1_0"),
         ("\n2 1 ", "\n\n2 1 ", "line 11: expected 5 columns with finite coordinates of an atom, got ''"),
     ],
 )

@@ -93,6 +93,7 @@ def test_tables_that_are_wrong(tmp_path):
         (data[: data.index(b"ASCII\n") + 6], "has no rows"),
         (data.replace(b"\t10\t", b"\tx\t", 1), "line 30: expected 26 numbers"),
         (data.replace(b"\t10\t", b"\t1.5\t", 1), "line 30: expected 26 numbers"),
+        (data.replace(b"\t10\t", b"\t1_0\t", 1), "line 30: expected 26 numbers"),
         (data.replace(b"\t10\t", b"\t", 1), "line 30: expected 26 numbers"),
         (b"TAPSIM", "does not begin like a .tapsim file"),
     ):

@@ -22,6 +22,8 @@ def test_tables_of_numbers(tmp_path):
         ("1 2\n1 two\n", r"line 2: expected 2 numbers \(x, y\) as in a table, got '1 two'"),
         ("1 2 3\n", "line 1: expected 2 numbers"),
         ("1 nan\n", "line 1: expected 2 numbers"),
+        ("1 2_0\n", "line 1: expected 2 numbers"),
+        ("1 \u0662\n", "line 1: expected 2 numbers"),
         ("# nothing\n", "has no numbers, expected a table"),
         ("", r"is empty \(0 bytes\), expected a table"),
     ):

@@ -65,6 +65,20 @@ def test_a_point_on_which_a_process_works_is_left_to_it(sweep):
     assert run_point(folder).name == "done"
 
 
+def test_a_point_that_ends_while_its_state_is_read_is_done(sweep, monkeypatch):
+    """It was "waiting": without a run before, and without a lock after, the process that worked on it had ended."""
+    folder = sweep.folder_of(sweep.keys[0])
+    assert run_point(folder).name == "done"
+    os.rename(folder / "run.h5", folder / "elsewhere")
+
+    def ended(folder):
+        os.rename(folder / "elsewhere", folder / "run.h5")
+        return False
+
+    monkeypatch.setattr(point_folder, "_is_locked", ended)
+    assert sweep.state(folder.name).name == "done"
+
+
 @pytest.mark.slow
 def test_a_run_that_another_program_writes_is_no_failure(sweep):
     """`apt-evap run`, started by Snakemake, locks its run but not the point."""

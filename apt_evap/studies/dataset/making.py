@@ -309,6 +309,8 @@ def _run_missing(sweep, keys, workers, note):
         if new:
             note(f"{len(states):,} of {len(sweep.points):,} runs are missing")
             worked |= dict.fromkeys(new) | run_sweep(sweep, new, workers if workers > 1 else None)
+            # those that another process had begun are tried again if it is killed
+            worked = {key: state for key, state in worked.items() if state is None or state.name != "running"}
         elif n_running:
             if not is_waiting:
                 note(f"waiting for {n_running:,} runs of another process")

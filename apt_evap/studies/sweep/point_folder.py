@@ -61,9 +61,11 @@ def write_text(path: Path, text: str) -> None:
 def state_of(folder: Path) -> PointState:
     """State of a point, from the files in its folder."""
     state = _stored_state(folder)
-    if state.name == "waiting" and _is_locked(folder):
+    if state.name != "waiting":
+        return state
+    if _is_locked(folder):
         return replace(state, name="running", message=_AT_WORK)
-    return state
+    return _stored_state(folder)  # again: a process that worked on it may have ended in between
 
 
 def _stored_state(folder):
