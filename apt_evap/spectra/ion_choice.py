@@ -29,6 +29,8 @@ UNNAMED = 40.0
 _MINOR = 0.02  # of the ions, below which an element has only the simplest molecules
 _TRIED = 8  # best ions that are fitted in each step
 _FOLLOWING = 4  # steps after an ion that takes the place of others
+_LEAST_ISOTOPE, _MOST_ISOTOPE = 0.3, 1.5
+"""Ions of a peak over those that an isotope would have, for this isotope. Without these bounds calcite takes 2.2 s."""
 _FEWEST, _LEAST = 20.0, 1e-5  # ions of an ion, and over all ions
 _SHARED = 0.3  # of the ions of an ion, in the main peak of another that it may replace
 
@@ -265,14 +267,17 @@ class IonChoice:
 
     def _with_isotopes(self, chosen, amplitudes, value):
         """An atomic ion in place of those in its main peak, if another of its isotopes is a peak without a name."""
-        before, best = (chosen, amplitudes, value), (value - 1e-6, None)
+        fit, before, best = self.fit, (chosen, amplitudes, value), (value - 1e-6, None)
         tried = self.candidates(chosen, amplitudes)
         tried = tried[self._atomic[tried] >= 0]
-        for unnamed in [number for number in chosen if number < self.fit.number]:
-            for other in tried[(self.fit.shares[tried, unnamed] > 0) & (self.fit.main[tried] != unnamed)].tolist():
-                main = self.fit.main[other]
-                start = [*(n for n in chosen if n != unnamed and self.fit.main[n] != main), other]
-                trial, chi2 = self.fit.solve(start)
+        main, ions = fit.main[tried], fit.contents.ions
+        for unnamed in [number for number in chosen if number < fit.number]:
+            # as many ions as this isotope has, if the main peak is that of the ion, or less if others are there
+            ratio = ions[unnamed] * fit.shares[tried, main] / np.maximum(ions[main] * fit.shares[tried, unnamed], 1e-9)
+            fits = (main != unnamed) & (ratio > _LEAST_ISOTOPE) & (ratio < _MOST_ISOTOPE)
+            for other in tried[fits].tolist():
+                start = [*(n for n in chosen if n != unnamed and fit.main[n] != fit.main[other]), other]
+                trial, chi2 = fit.solve(start)
                 grown = self._grown(*self.pruned(start, trial, chi2 + self.cost(start)), _FOLLOWING)
                 if other in grown[0] and grown[2] < best[0]:
                     best = grown[2], grown
