@@ -1,8 +1,7 @@
 """Made spectra of forty materials, with peaks of three kinds: what users measure, and not what chose a constant.
 
 Ions and their parts are such as spectra of these materials show; their numbers are ours. With the seed 77, those of
-CuCrZr, Zircaloy, steel, V-4Cr-4Ti and ODS steel by laser pulses chose the longest tail of peaks, and that of ZnO in a
-reflectron showed that two peaks side by side were one.
+CuCrZr, Zircaloy, steel, V-4Cr-4Ti and ODS steel by laser pulses chose the longest tail of peaks.
 """
 
 import numpy as np

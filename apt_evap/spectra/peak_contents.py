@@ -88,8 +88,7 @@ class PeakContents:
     def __init__(self, mass: Floats) -> None:
         self.scale = PeakScale(mass)
         self.counts = self.scale.counts(mass)
-        broad = bool(self.scale.sigma(30.0) > _BROAD)
-        self.places, self._smooth = find_places(self.counts, not broad)
+        self.places, self._smooth = find_places(self.counts)
         self.seen_at = self.scale.mass(self.places) if len(self.places) else np.zeros(0)
         """m/n of the peaks [Da]."""
         longest = _LONGEST / float(self.scale.sigma(30.0))
@@ -103,7 +102,7 @@ class PeakContents:
         self._smooth_background = _background_basis(self.scale)
         self._mixture = np.array([*_MIXTURE[0][: len(self.tails)], *_MIXTURE[1]])
         self._start: Floats | None = None  # amplitudes of the background of the last fit
-        if len(self.places) and broad:
+        if len(self.places) and self.scale.sigma(30.0) > _BROAD:
             self.places = self._with_shoulders(self.places)
             self.seen_at = self.scale.mass(self.places)
 

@@ -29,9 +29,6 @@ _FARTHEST = 500
 errors below 3.5 %, and below 8 % with 250 steps (seed 202706)."""
 _SURE = 3.0  # standard errors by which it must be more
 _PROMINENCE = 5.0  # of a peak, in standard deviations of counting
-_SPLIT, _DIP = 10.0, 0.05
-"""The same of peaks that only a filter of half the width parts, and over their height. Of 120 made spectra of 40
-materials, none of which chose them, they change one: O2+ beside Zn2+, L1 40 to 0.5 at.%."""
 APART = 2.0
 """Standard deviations between two peaks; of nearer ones the higher is kept."""
 
@@ -192,23 +189,13 @@ def _half_width(smooth, counts, top, step, blur=1.5, farthest=150):
     return math.sqrt(max((half_width / math.sqrt(2 * math.log(2))) ** 2 - (blur * _STEP) ** 2, (0.8e-4) ** 2))
 
 
-def find_places(counts: Floats, apart: bool = True) -> tuple[Floats, Floats]:
-    """Places of the peaks of a histogram in bins, and the histogram smoothed by the width of a peak.
-
-    With `apart` also those of two peaks side by side that are one in the smoothed histogram.
-    """
+def find_places(counts: Floats) -> tuple[Floats, Floats]:
+    """Places of the peaks of a histogram in bins, and the histogram smoothed by the width of a peak."""
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import find_peaks
 
     smooth = gaussian_filter1d(counts, float(BINS))
-    wide = 2 * math.sqrt(math.pi) * BINS  # bins that are effectively in the filter
-    tops, _ = find_peaks(2 * np.sqrt(smooth * wide + 0.375), prominence=_PROMINENCE)
-    if apart:
-        heights = 2 * np.sqrt(gaussian_filter1d(counts, BINS / 2) * wide / 2 + 0.375)
-        both, found = find_peaks(heights, prominence=_SPLIT)
-        both = both[found["prominences"] > _DIP * heights[both]]
-        both = both[np.abs(both[:, None] - tops).min(1, initial=len(counts)) > APART * BINS]
-        tops = np.sort(np.concatenate([tops, both]))
+    tops, _ = find_peaks(2 * np.sqrt(smooth * 2 * math.sqrt(math.pi) * BINS + 0.375), prominence=_PROMINENCE)
     kept: list[int] = []
     for top in tops.tolist():
         if kept and top - kept[-1] < APART * BINS:

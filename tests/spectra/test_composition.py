@@ -93,7 +93,7 @@ def test_long_tails_are_not_hydrides():
 
 
 def test_two_sharp_peaks_side_by_side_are_two():
-    """O2+ 3.7 standard deviations beside 64Zn2+, with a dip between them. Measured 0.4 at.%; as one peak 40 at.%."""
+    """O2+ 3.7 standard deviations beside 64Zn2+, with a dip between them. Measured 0.5 at.%, and 40 as one peak."""
     ions = {("Zn", 1): 18, ("Zn", 2): 22, ("O", 1): 11, ("O2", 1): 17, ("ZnO", 1): 1.5, ("H", 1): 4}
     result = ae.spectrum(made(ions, 300_000, width=1.8e-4, tail=1e-4), ["Zn", "O", "H"])
     assert result.unexplained_part < 0.005
