@@ -177,15 +177,17 @@ def specimens(rng, kind, number, change=lambda rng, ions: ions):
         yield at, ions, *draw(rng, ions, ions_number, width, tail)
 
 
-def materials(seed=606301):
+def materials(seed=606301, judges=717101):
     """Spectra of materials with peaks of three kinds, a million ions each."""
-    from material_spectra import MATERIALS, SHAPES, ions_of
+    from material_spectra import JUDGES, MATERIALS, SHAPES, ions_of
     from material_spectra import draw as draw_material
 
-    rng = np.random.default_rng(seed)
-    for shape in SHAPES:
-        every = ((name, ions_of(name)) for name in MATERIALS)
-        judge(shape, ((name, ions, *draw_material(rng, ions, 1_000_000, shape)) for name, ions in every))
+    for materials, first, blinds in ((MATERIALS, seed, (True, False)), (JUDGES, judges, (False,))):
+        rng = np.random.default_rng(first)
+        for shape in SHAPES:
+            every = ((name, ions_of(name)) for name in materials)
+            drawn = ((name, ions, *draw_material(rng, ions, 1_000_000, shape)) for name, ions in every)
+            judge(f"{len(materials)} materials, {shape}", drawn, blinds)
 
 
 def judge(kind, specimens, blinds=(True, False)):
