@@ -121,23 +121,32 @@ def kept_runs(pytestconfig, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def indexed_once(pytestconfig, tmp_path_factory):
-    """`ae.index`, computed by the first test that needs it."""
-    packages = ("_common", "_core", "specimen", "detection", "maps")
-    folder = kept_folder(pytestconfig, tmp_path_factory, "indexings", packages)
+def computed_once(pytestconfig, tmp_path_factory):
+    """`compute()`, by the first test that needs what a package of the library computes from these arguments."""
 
-    def indexed(measured, material, **options):
-        key = hash_of(pickle.dumps((measured, material, sorted(options.items()))))
-        path = folder / f"{key}.pickle"
+    def computed(name, package, arguments, compute):
+        key = hash_of(pickle.dumps(arguments))
+        path = kept_folder(pytestconfig, tmp_path_factory, name, (*PACKAGES_OF_RUNS, package)) / f"{key}.pickle"
         lock = FileLock(path.with_suffix(".lock"), key, wait=lambda: None)
         try:
             if not path.exists():
-                indexing = ae.index(measured, material, **options)
+                content = compute()
                 with replace_file(path) as file:
-                    pickle.dump(indexing, file)
+                    pickle.dump(content, file)
         finally:
             lock.release()
         return pickle.loads(path.read_bytes())
+
+    return computed
+
+
+@pytest.fixture(scope="session")
+def indexed_once(computed_once):
+    """`ae.index`, computed by the first test that needs it."""
+
+    def indexed(measured, material, **options):
+        arguments = (measured, material, sorted(options.items()))
+        return computed_once("indexings", "maps", arguments, lambda: ae.index(measured, material, **options))
 
     return indexed
 

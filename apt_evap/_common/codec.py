@@ -20,7 +20,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, replace
-from typing import Any, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 import numpy as np
 
@@ -334,6 +334,21 @@ def for_json(thing: Any) -> Any:
     if isinstance(plain, dict):
         return {name: for_json(item) for name, item in plain.items()}
     return [for_json(item) for item in plain] if isinstance(plain, list) else plain
+
+
+class ForJson:
+    """Results with a `to_dict` of the attributes that `_in_json` names, by default of all fields."""
+
+    _in_json: ClassVar[tuple[str, ...]] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Results as numbers, texts and lists, None for NaN, for JSON; without arrays that have a row for each ion.
+
+        Returns
+        -------
+        dict
+        """
+        return for_json({name: getattr(self, name) for name in self._in_json or vars(self)})
 
 
 def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:

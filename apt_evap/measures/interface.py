@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from apt_evap._common.codec import for_json
+from apt_evap._common.codec import ForJson
 from apt_evap._common.types import Booleans, Estimated, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_number
 
@@ -21,7 +20,7 @@ _TINY = 1e-6  # a fraction of 0 or 1 has no likelihood
 
 
 @dataclass(frozen=True, eq=False)
-class DistanceProfile:
+class DistanceProfile(ForJson):
     """Fraction of chosen ions as a function of the distance from an interface.
 
     Parameters
@@ -49,18 +48,9 @@ class DistanceProfile:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.sqrt(self.fraction * (1 - self.fraction) / self.ions)
 
-    def to_dict(self) -> dict[str, Any]:
-        """All results as numbers and lists, None for NaN, for JSON.
-
-        Returns
-        -------
-        dict
-        """
-        return for_json(vars(self))
-
 
 @dataclass(frozen=True, eq=False)
-class CompositionProfile:
+class CompositionProfile(ForJson):
     """Composition as a function of a coordinate: a proxigram if this is the distance from an isosurface.
 
     Parameters
@@ -82,6 +72,7 @@ class CompositionProfile:
     atoms: Floats = field(repr=False)
     coordinates: Floats = field(repr=False)
     area: float = math.nan
+    _in_json = ("edges", "elements", "atoms", "fractions", "fraction_errors", "area")
 
     @property
     def centres(self) -> Floats:
@@ -114,16 +105,6 @@ class CompositionProfile:
         """
         column = self.elements.index(check_choice(element, "element", self.elements))
         return DistanceProfile(self.edges, self.atoms.sum(axis=1), self.fractions[:, column])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Edges, elements, atoms, fractions and errors as numbers and lists, for JSON.
-
-        Returns
-        -------
-        dict
-        """
-        names = ("edges", "elements", "atoms", "fractions", "fraction_errors", "area")
-        return for_json({name: getattr(self, name) for name in names})
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from apt_evap._common.codec import for_json
+from apt_evap._common.codec import ForJson
 from apt_evap._common.short_repr import short_repr
 from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_array, check_choice, check_count, check_number, check_sequence, short_text
@@ -99,7 +99,7 @@ class ErrorField:
 
 
 @dataclass(frozen=True, eq=False)
-class ReconstructionErrors:
+class ReconstructionErrors(ForJson):
     """Fitted constants, and residuals of the fitted positions from the true sites.
 
     The fitted position of an ion at x, y, at the depth h below an apex at the depth z, is (lateral_scale Rot(rotation)
@@ -154,6 +154,10 @@ class ReconstructionErrors:
     radius_factor: float = 1.0
     compression: float = math.nan
     by_group: GroupErrors | None = field(default=None, repr=False)
+    _in_json = (
+        *("shift", "rotation", "lateral_scale", "depth_scale", "radius_factor", "compression", "lateral_rms"),
+        *("depth_rms", "order_correlation", "cylinders", "by_angle", "by_depth", "by_group"),
+    )
 
     def __repr__(self) -> str:
         return (
@@ -227,17 +231,6 @@ class ReconstructionErrors:
         scatter = np.sqrt(variances[0] + variances[1]), np.sqrt(variances[2])
         tables = [values.reshape(shape) for values in (ions, *means, *scatter)]
         return ErrorField(angle_edges, depth_edges, *tables)  # type: ignore[arg-type]
-
-    def to_dict(self) -> dict[str, Any]:
-        """All but the arrays with a row per ion as numbers and lists, None for NaN, for JSON.
-
-        Returns
-        -------
-        dict
-        """
-        names = ("shift", "rotation", "lateral_scale", "depth_scale", "radius_factor", "compression", "lateral_rms")
-        names += ("depth_rms", "order_correlation", "cylinders", "by_angle", "by_depth", "by_group")
-        return for_json({name: getattr(self, name) for name in names})
 
 
 def true_sites(hits: Hits, truth: Run | ArrayLike | None) -> Floats:

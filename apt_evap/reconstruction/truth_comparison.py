@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from apt_evap._common.codec import for_json
+from apt_evap._common.codec import ForJson
 from apt_evap._common.types import Estimated
 from apt_evap._common.validation import check_choice, check_kind, check_number, check_sequence, short_text
 from apt_evap.detection.instrument import Instrument
@@ -27,7 +27,7 @@ _FEWEST = 4  # simulations of a correction: a line has two constants
 
 
 @dataclass(frozen=True)
-class TruthComparison:
+class TruthComparison(ForJson):
     """Values of measures, each of several point clouds of one run.
 
     Parameters
@@ -74,19 +74,6 @@ class TruthComparison:
 
     def __repr__(self) -> str:
         return f"<TruthComparison of {', '.join(self.values)}: {', '.join(self.ions)}>"
-
-    def to_dict(self) -> dict[str, Any]:
-        """All results as numbers and lists, None for NaN, for JSON.
-
-        Returns
-        -------
-        dict
-        """
-        values = {
-            name: {cloud: {"value": value, "error": error} for cloud, (value, error) in row.items()}
-            for name, row in self.values.items()
-        }
-        return for_json({"ions": dict(self.ions), "values": values})
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> TruthComparison:

@@ -17,7 +17,7 @@ from apt_evap.simulation.run_hdf5 import count_ions, is_run
 SIMULATION = "entry1/simulation"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run():
     tip = ae.Tip("Ni", apex_radius=1.5, axis=(1, 1, 1), shank_length=1.5)
     settings = ae.evaporation.ChargeSettings(sweep_interval=20)

@@ -195,7 +195,7 @@ CORNERS = [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)]
 shell = ae.Tip(**TIP)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ready():
     """A simulation, its run, and the ions on file."""
     simulation = ae.Simulation(shell, n_threads=1)

@@ -84,7 +84,7 @@ def test_spheroid():
     assert np.abs(ratios[1]).max() < 0.6 * np.abs(ratios[0]).max()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def disc():
     """A disc of a triangular lattice of spacing 0.25 nm, radius 6 nm."""
     i, j = np.meshgrid(np.arange(-40, 41), np.arange(-40, 41))

@@ -31,7 +31,7 @@ def drift(emitter):
 # ---- accuracy ------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def thousand(tip20):
     """R = 20 a after 1,000 events at the default settings: counts and drift up to then, and the emitter, relaxed."""
     emitter = ae.evaporation.Emitter(tip20, 1000.0)

@@ -197,7 +197,7 @@ def test_morton_order_goes_by_octants(rng):
     assert (np.diff(octant) >= 0).all()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def crowd():
     """70,000 places, several blocks of the sort and subtrees: a clump, duplicates and a place far away among them."""
     generator = np.random.default_rng(4)

@@ -33,7 +33,7 @@ def potential_of_others(points, positions, charges):
     return np.where(distances > 1e-6, charges / np.maximum(distances, 1e-6), 0.0).sum(axis=1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tree(tip12):
     """A tree from which atoms were removed, and to which atoms were added."""
     emitter = emitter_of(tip12, ae.Robin(), sweep_interval=200)

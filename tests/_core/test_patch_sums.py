@@ -37,7 +37,7 @@ void of_inverse(Index n, Index m, float *rows, float *r, float *q, float *e)
 N, STRIDE = 150, 192  # two complete blocks of 64 atoms, and a part of a third one
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sums(tmp_path_factory):
     """The library, as a function of its function's name and arguments."""
     compiler, folder = shutil.which("gcc"), tmp_path_factory.mktemp("sums")

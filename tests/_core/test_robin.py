@@ -139,7 +139,7 @@ def test_spheroid():
 # ---- the iteration -------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def direct12(surface12):
     positions, normals, _ = surface12
     return twins.robin(positions, normals, tolerance=1e-9)

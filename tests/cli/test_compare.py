@@ -30,7 +30,7 @@ HERE = ["--registration", "0,1,0,0"]
 NO_PICTURES = pytest.mark.usefixtures("blank_pictures")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(small_tip, made_once, tmp_path_factory):
     """A run, and what would have been measured of the same ions with other random numbers: ions, a map, a run."""
     folder = tmp_path_factory.mktemp("made")

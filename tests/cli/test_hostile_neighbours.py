@@ -63,7 +63,7 @@ class Executed:
         return Path.touch, (Path("EXECUTED"),)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def hostile(tmp_path_factory):
     """Harmless files among settings and modules that execute code."""
     folder = tmp_path_factory.mktemp("hostile")

@@ -16,7 +16,7 @@ from apt_evap.reconstruction.reconstruction_settings import PROJECTIONS, PROTOCO
 from apt_evap.simulation.ion_image import GASES
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def options():
     """The options of each command by the names of their values."""
     (commands,) = (action for action in make_parser()._actions if isinstance(action, argparse._SubParsersAction))

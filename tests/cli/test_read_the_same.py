@@ -67,7 +67,7 @@ def pulses(numbers):
     return {"pulse_id": rows, "multiplicity": counts[rows]}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("files")
     random = np.random.default_rng(5)

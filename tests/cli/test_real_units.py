@@ -34,7 +34,7 @@ timing = { jitter = 0.1, temperature = 80.0 }
 """
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(tmp_path_factory):
     """A run at 80 K in real units, and one at 0 K as simulated, made once by the command line."""
     folder = tmp_path_factory.mktemp("made")

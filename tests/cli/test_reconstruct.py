@@ -153,7 +153,7 @@ def test_all_that_a_file_lacks_is_named_at_once_and_is_enough(measured, tmp_path
     assert "positions" not in capsys.readouterr().err  # all at one place: none
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def radius5(made_once, tmp_path_factory):
     """A run of 1,200 ions of a tip with a radius of 5 nm, and its file."""
     tip = ae.Tip("Ni", apex_radius=5.0, axis=(1, 1, 1), shank_length=5.0, depth=1.5)

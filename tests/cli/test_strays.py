@@ -18,7 +18,7 @@ OUT = ["-o", "a.png"]
 QUICK = ["--means", "0.1,0.2", "--relative-spreads", "0.5", "--replicas", "1", "--resamples", "2", "--bins", "24"]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(small_tip, made_once, tmp_path_factory):
     """A run, and folders with the same ions of another one: with strays, and without these ions."""
     folder = tmp_path_factory.mktemp("strays")

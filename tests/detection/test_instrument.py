@@ -51,7 +51,7 @@ def dead_ions(hits, dead_time, dead_zone):
     return lost
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(made_once, nickel):
     tip = ae.Tip(nickel, 8 * nickel.a, axis=(1, 1, 1), shank_length=8 * nickel.a, offset_seed=1)
     return made_once(tip, 400, seed=1).at_evaporation_field()

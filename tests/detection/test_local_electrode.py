@@ -17,12 +17,12 @@ from apt_evap.units import FLIGHT_TIME
 SHANKS = (1.5, 5.0, 10.0, 15.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def lens():
     return LocalElectrode(40e3, 20e3, 5.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def independent():
     """The geometry of the independent code: its shanks were 200 micrometres long."""
     return {angle: LocalElectrode(40e3, 20e3, angle, 200e3) for angle in SHANKS}
@@ -271,7 +271,7 @@ def test_radii_of_ten_million_ions_take_a_second(lens):
     assert time.process_time() - start < 2.5
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def drawn():
     return LocalElectrode(40e3, 20e3, 5.0, detector_potential=4300.0)
 

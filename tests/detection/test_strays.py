@@ -90,6 +90,14 @@ def test_strays_are_found(kind, shape, dtype):
         assert np.flatnonzero(find_strays(x, y)).tolist() == rows.tolist()
 
 
+@pytest.mark.parametrize(("share", "stray"), [(0.03, True), (0.08, False)])
+def test_a_part_apart_is_stray_below_a_twentieth_of_the_largest(share, stray):
+    places = np.concatenate([disc(20_000, 26), 75 + disc(int(share * 20_000), 27, radius=10)])
+    strays = find_strays(places.real, places.imag)
+    assert (strays is not None and strays.tolist() == (np.arange(len(places)) >= 20_000).tolist()) == stray
+    assert stray or strays is None
+
+
 def test_strays_that_are_scattered_do_not_join_each_other():
     """2 % of the ions over 600 x 600 mm: those beside the field of view cannot be told from it."""
     places = disc(6000, 25)

@@ -57,12 +57,12 @@ def evaporated(tip, bonds, events=250, law=ae.Extremal, **options):
     return emitter, sites, np.setdiff1d(np.arange(len(tip)), sites)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def aluminium_copper():
     return ae.Tip("Al", apex_radius=3.0, axis=(1, 1, 1), shank_length=3.0, solutes={"Cu": 0.2}, seed=1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def iron_tungsten():
     return ae.Tip("Fe", apex_radius=2.5, axis=(1, 1, 0), shank_length=2.5, solutes={"W": 0.1}, seed=2)
 

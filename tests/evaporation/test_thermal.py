@@ -441,7 +441,7 @@ def test_the_working_point_does_not_depend_on_the_form_of_the_barrier(barrier):
 # ---- alloys --------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def alloy():
     return ae.Tip("Al", apex_radius=2.0, axis=(1, 1, 1), shank_length=2.0, solutes={"Cu": 0.2}, seed=1)
 

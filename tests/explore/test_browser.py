@@ -60,7 +60,7 @@ def explorer_in(folder, *words):
     assert process.returncode == 0
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def served(small_tip, made_once, tmp_path_factory):
     """Address of a run beside ions."""
     folder = tmp_path_factory.mktemp("served")

@@ -36,12 +36,12 @@ PERTURBATIONS = [
 ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip, made_once):
     return made_once(small_tip, 2000, seed=1, **ROUGH)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run_in(run):
     """Function of the units: the run in them."""
 
@@ -55,7 +55,7 @@ def run_in(run):
     return converted
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def measured(run):
     """Ions of the same run with other random numbers, turned and scaled."""
     hits = TURNED.hits(replace(run, seed=2).hits(ae.RollUp(ENERGY)))
@@ -63,7 +63,7 @@ def measured(run):
     return ae.Hits(x=hits.x, y=hits.y, mass_to_charge=hits.mass_to_charge, pulse_id=pulses).within_circle(35.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def explorer(run, measured):
     return Explorer(run, measured, TURNED)
 

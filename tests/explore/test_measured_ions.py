@@ -19,7 +19,7 @@ from apt_evap.io.measured_file import MeasuredFile
 pytestmark = pytest.mark.usefixtures("spectra_once")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def hits():
     """Ions of copper inside a circle, of silicon outside it, and a background."""
     rng = np.random.default_rng(4)

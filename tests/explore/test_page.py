@@ -41,12 +41,12 @@ from apt_evap.io.rrng import write_rrng
 SECONDS = 60  # until a test gives up: the machine may be busy
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip, made_once):
     return made_once(small_tip, 2000, seed=1, **ROUGH)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def measured(run):
     hits = replace(run, seed=2).hits(ae.RollUp(0.2))
     return hits.map(40, extent=(-60, 60, -60, 60))
@@ -80,7 +80,7 @@ def opened(run, measured):
     opened.page.close()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def shared(run, measured):
     """Such a page for tests that leave it as it was."""
     opened = Opened(Explorer(run, measured, ae.Registration(0.0, 1.0, (0.0, 0.0)), preview=500))

@@ -11,7 +11,7 @@ from apt_evap.plot.report.measurement_report import measurement_section
 SCALE, FIELD, VOLUME = 60.0, 35.0, 0.352**3 / 4  # mm/rad, V/nm, nm^3
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def measured(indexed_nickel):
     """Map and candidate of nickel at a scale of 60 mm/rad."""
     _, indexing = indexed_nickel

@@ -12,7 +12,7 @@ HERE = ae.Registration(0.0, 1.0, (0.0, 0.0))
 GRID = {"means": (0.05, 0.155, 0.3), "relative_spreads": (0.316, 1.0), "progress": False, "n_threads": 1, "replicas": 4}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run_of(nickel, made_once):
     """Function of an axis, the origin of the lattice and a number of ions: their run."""
 
@@ -23,21 +23,21 @@ def run_of(nickel, made_once):
     return make
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def runs(run_of):
     """1,500 ions of three tips: two along [111], of different origins of the lattice, and one along [001]."""
     tips = {"right": ((1, 1, 1), 1), "axis": ((0, 0, 1), 1), "measured": ((1, 1, 1), 2)}
     return {name: run_of(*tip) for name, tip in tips.items()}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def few(run_of):
     """700 ions of them."""
     tips = {"right": ((1, 1, 1), 1), "axis": ((0, 0, 1), 1), "measured": ((1, 1, 1), 2)}
     return {name: run_of(*tip, 700) for name, tip in tips.items()}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def fit(runs):
     measured = runs["measured"].hits(ROLLUP)
     candidates = {name: runs[name] for name in ("axis", "right")}

@@ -58,12 +58,12 @@ def run_of(radius, number, ions):
     return simulation.run(ions, EMISSIONS, responses=False, progress=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def family(made_once):
     return [made_once(tip(radius, radius), 1000, EMISSIONS, responses=False, seed=radius) for radius in (8, 10, 12, 14)]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def pretended(made_once):
     """The first of the family as if it were of four tips, for tests of what is refused."""
     run = made_once(tip(8, 8), 1000, EMISSIONS, responses=False, seed=8)

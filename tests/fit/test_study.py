@@ -31,25 +31,25 @@ ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
 LATERAL = ae.LateralVelocity(ae.TruncatedNormal(0.3, 0.316 * 0.3))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(run20):
     """15,000 ions of Ni[111], R = 20 a, with responses alone."""
     return replace(run20, perturbations=(), flown=())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def few(few20):
     """6,000 of them."""
     return replace(few20, perturbations=(), flown=())
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def redrawn(few):
     """The ions of `few` with other random numbers, for tests in which an energy is not found."""
     return replace(few, seed=2)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def other(nickel, made_once):
     """Of a tip with another origin of the lattice, and with other random numbers: no ion is one of `run`."""
     tip = ae.Tip(nickel, apex_radius=20 * nickel.a, axis=(1, 1, 1), shank_length=20 * nickel.a, offset_seed=5)
@@ -559,7 +559,7 @@ def measured_map(other, perturbation, draws=8):
     return replace(frame, values=sum(draws))
 
 
-@pytest.fixture(scope="module", params=[pytest.param(name, marks=pytest.mark.slow) for name in ("roll-up", "lateral")])
+@pytest.fixture(scope="session", params=[pytest.param(name, marks=pytest.mark.slow) for name in ("roll-up", "lateral")])
 def twin(request, run, other):
     """A study of a map with hidden energies."""
     hidden, truth = TWINS[request.param]

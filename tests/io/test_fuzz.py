@@ -212,7 +212,7 @@ def test_changed_specimens(tmp_path, name, changes, size):
     assert tip is None or len(tip) >= 2
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def of_ase(tmp_path_factory):
     """A good file of some formats of ASE, by name."""
     ase = pytest.importorskip("ase")

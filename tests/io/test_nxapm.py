@@ -98,7 +98,7 @@ def check_structure(path, own, is_simulation, elements):
         }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run():
     tip = ae.Tip("Ni", apex_radius=1.8, axis=(1, 1, 1), shank_length=1.8, solutes={"Al": 0.1}, seed=1)
     simulation = ae.Simulation(tip, seed=1, n_threads=1, law=ae.Arrhenius(temperature=50.0))

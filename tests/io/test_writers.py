@@ -244,7 +244,7 @@ def test_what_cannot_be_written(tmp_path):
     assert len(parse_xyz(tmp_path / "a.XYZ")["pos"]) == 3
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def two_phases():
     """Hits of a specimen of nickel with a particle below its apex, and their elements and phases."""
     sphere = ae.specimen.Sphere((0, 0, 2.0), 0.9)

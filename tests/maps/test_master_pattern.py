@@ -9,7 +9,7 @@ from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
 from apt_evap.specimen.symmetry import point_group
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run_of(nickel, made_once):
     """Function of a number of ions: their run."""
     tip = ae.Tip(nickel, 9 * nickel.a, axis=(0.36, 0.52, 0.775), shank_length=12 * nickel.a, offset_seed=1)
@@ -19,12 +19,12 @@ def run_of(nickel, made_once):
     return lambda ions: made_once(tip, ions, emissions, **options)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(run_of):
     return run_of(3_000)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def few(run_of):
     return run_of(1_500)
 

@@ -26,7 +26,7 @@ ROLLED = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
 FASTER = ae.RollUp(ae.TruncatedNormal(0.3, 0.1))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def low(made_once):
     """Ni[124], an axis without any symmetry: 16,000 ions."""
     nickel = ae.material("Ni")
@@ -34,7 +34,7 @@ def low(made_once):
     return made_once(tip, 16_000, voltage=1000.0, seed=1, **ROUGH)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def simulated(low):
     """What `low` shows, 48,000 hits."""
     return together(low.hits(ROLLED), replace(low, seed=2).hits(ROLLED), replace(low, seed=3).hits(ROLLED))
@@ -70,7 +70,7 @@ def draws(run, perturbation, seed, part=slice(None)):
         yield replace(run, seed=1000 * seed + number).hits(perturbation)[part]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def map_of(low):
     """`measured` of draws of `low`, made once for each registration, radius and seed."""
     return cache(lambda true, radius, seed: measured(draws(low, FASTER, seed), true, radius, seed))

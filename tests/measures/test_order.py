@@ -9,7 +9,7 @@ from apt_evap.specimen.lattice import Lattice, lattice_sites_in
 A = 0.352  # nm
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cube():
     """Sites of an fcc cube of 8 cells, and their corner of the cell: the minority of L1_2."""
     sites, _ = lattice_sites_in(

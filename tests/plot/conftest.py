@@ -9,7 +9,7 @@ from rough import ROUGH
 import apt_evap as ae
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def study(small_tip, made_once):
     """Study of 1,800 ions with a map of the same run as the measured one; two roll-up fractions."""
     run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1800]

@@ -28,12 +28,12 @@ from apt_evap.simulation.voltage_history import evaporation_voltages, smoothed_h
 from apt_evap.spectra.charge_states import charge_history, charge_state_ratio_map, ion_charges
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def emitter(small_tip):
     return ae.evaporation.Emitter(small_tip)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip, made_once):
     """250 ions with responses."""
     return made_once(small_tip, 250, voltage=1000.0, seed=2)
@@ -311,7 +311,7 @@ def test_history_of_a_measurement():
 # ---- voltage, rate and charges -------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(run):
     """The run in real units, with ions of two charges."""
     return run.at_evaporation_field(
@@ -529,7 +529,7 @@ def charged(n, slope, seed, half=30.0):
     return ae.Hits(x=x, y=y, extra={"charge_state": charges})
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ratios():
     first = charge_state_ratio_map(charged(20_000, 0.02, 1), "Ni", 1)
     return first, charge_state_ratio_map(charged(20_000, 0.01, 2), "Ni", 1, like=first)

@@ -25,7 +25,7 @@ from apt_evap.plot.report.html_page import read_report
 from apt_evap.plot.report.study_report import doubts
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def page(study, tmp_path_factory):
     """A report with all its parts, and its text."""
     folder = tmp_path_factory.mktemp("report")
@@ -37,7 +37,7 @@ def page(study, tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def seen(page):
     return Reader(page.read_text())
 

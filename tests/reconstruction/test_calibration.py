@@ -12,7 +12,7 @@ RADIUS, DISTANCE, XI, RIM = 30.0, 90.0, 1.5, 15.0  # nm, mm, -, mm
 ETA = 0.6
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def aluminium():
     """Al along [002], evaporated layer by layer by a cap of 30 nm: true sites with z outwards, and hits."""
     rim = math.atan(RIM / DISTANCE) + math.asin((XI - 1) * math.sin(math.atan(RIM / DISTANCE)))

@@ -112,7 +112,7 @@ def test_the_order_is_the_correlation_of_ranks(cloud, rng):
     assert 0.5 < errors.order_correlation < 0.99
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def cap():
     """Hits of a cap that follows the point projection exactly, and their sites: R = 30 nm, compression 1.6."""
     rng = np.random.default_rng(11)

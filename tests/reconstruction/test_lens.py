@@ -13,7 +13,7 @@ RIM = 20.0  # mm
 
 
 @pytest.fixture(
-    scope="module",
+    scope="session",
     params=[
         pytest.param(0.0, id="field-free drift", marks=pytest.mark.slow),
         pytest.param(4300.0, id="potential of the detector"),
@@ -23,7 +23,7 @@ def lens(request):
     return ae.detection.LocalElectrode(40e3, 20e3, SHANK, detector_potential=request.param)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def receding(lens):
     """Ions of a cap that recedes from a radius of 20 to 40 nm on its shank, seen through the lens, and their sites."""
     rng = np.random.default_rng(1)

@@ -19,7 +19,7 @@ def shift_of(places):
 NOISE = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def table():
     rng = np.random.default_rng(8)
     places = 1.6 * rng.random((60_000, 2)) - 0.8
@@ -88,7 +88,7 @@ def test_a_shift_is_added_on_the_cap(table):
         ae.reconstruct(hits, **known, origins=shifts)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def twins(nickel, made_once):
     """Runs of Ni[111], R = 12 a, that differ by the origin of the lattice and the seed."""
     flight = ae.simulation.FlightSettings(opening_angle=0.6, tolerance=1e-2)

@@ -23,7 +23,7 @@ def reconstruction_of(positions):
     return Reconstruction(positions, hits, np.full(len(positions), 100.0), settings, geometry)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def alloy():
     """Sites of a sphere at the origin in a matrix, z out of the specimen; whether each is in the sphere; species."""
     rng = np.random.default_rng(5)

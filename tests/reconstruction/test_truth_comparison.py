@@ -11,7 +11,7 @@ from apt_evap._common.types import Estimated
 from apt_evap.reconstruction.truth_comparison import TruthComparison
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run():
     tip = ae.Tip("Ni", apex_radius=2.5, axis=(1, 1, 1), solutes={"Al": 0.1}, seed=1)
     return ae.Simulation(tip, seed=1).run(300, [ae.Unperturbed()], responses=False, progress=False)

@@ -35,7 +35,7 @@ def two_grains(rng):
     return rng.permutation(np.concatenate([right[right[:, 0] < across], other[other[:, 0] > across]]))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def twin():
     rng = np.random.default_rng(5)
     directions = patterned(12_000, rng)

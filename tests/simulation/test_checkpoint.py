@@ -49,7 +49,7 @@ class Processes:
         self._parent.wait()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def processes():
     processes = Processes()
     yield processes

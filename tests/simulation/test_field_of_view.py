@@ -25,7 +25,7 @@ EMISSIONS = (
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tips(nickel):
     """Small tips, where ions deviate most; in the alloy, atoms of tungsten stand out."""
     radius = 8 * nickel.a
@@ -40,13 +40,13 @@ def simulate(tip, n=400, field_of_view=None, detector=DETECTOR, **options):
     return ae.Simulation(tip, seed=1, detector=detector, flight_settings=flights, **options).run(n, progress=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def every_ion(tips):
     """All ions of the alloy."""
     return simulate(tips["alloy"])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def part_of_view(tips):
     """The same ions in a field of view of 20 degrees."""
     return simulate(tips["alloy"], field_of_view=20.0)

@@ -198,7 +198,7 @@ def test_radial_on_a_dense_sphere():
 # ---- a specimen ----------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def scene(surface12, tip12):
     """Tree of the surface of `tip12` after its most charged atom has left, and launches of it and of other atoms."""
     positions, normals, charges = surface12
@@ -256,7 +256,7 @@ def dop853(atoms, charges, start, push, centre, reach):
     return np.array([*found.y[:, -1], found.t[-1]])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def reference(scene, tip12):
     atoms, charges, starts, push = scene
     centre, reach = np.array([0.0, 0.0, tip12.apex]), DEFAULT.reach * tip12.nearest_neighbour_distance

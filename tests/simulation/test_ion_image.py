@@ -56,7 +56,7 @@ class Even:
         return charges
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sphere():
     """A sphere of 6 nm of 8,000 evenly spaced charges, 0.24 nm apart."""
     n = 8000
@@ -101,7 +101,7 @@ def test_a_sphere_is_projected_radially(sphere):
     assert image.magnification == pytest.approx(50.0 / 6.0, rel=0.01)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def evolved(nickel):
     """Ni[111], R = 16 a, after 1,500 events."""
     tip = ae.Tip(nickel, apex_radius=16 * nickel.a, axis=(1, 1, 1), shank_length=16 * nickel.a, offset_seed=1)

@@ -17,12 +17,12 @@ ROLLED = ae.RollUp(0.1)
 LENS = ae.detection.LocalElectrode.preset("local electrode")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip):
     return ae.Simulation(small_tip, seed=1, n_threads=1).run(150, progress=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(run):
     return run.at_evaporation_field()
 

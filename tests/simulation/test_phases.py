@@ -15,7 +15,7 @@ def run_of(tip, n=250, **options):
     return ae.Simulation(tip, n_threads=1).run(n, responses=False, progress=False, **options)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def mixed():
     """A tip of three phases on two lattices, with a void."""
     phases = [

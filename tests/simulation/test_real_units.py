@@ -17,12 +17,12 @@ def simulate(tip, n=400, voltage=1000.0, **options):
     return ae.Simulation(tip, voltage=voltage, seed=3, n_threads=1, **options).run(n, progress=False)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(made_once, tip12):
     return made_once(tip12, 600, seed=3)[:400]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(run):
     return run.at_evaporation_field()
 

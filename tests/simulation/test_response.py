@@ -157,7 +157,7 @@ def test_an_equidistant_detector_keeps_angles_and_times():
 # ---- against flights -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(tip12):
     return ae.Simulation(tip12, seed=3).run(400, emissions=FLOWN, progress=False)
 

@@ -9,7 +9,7 @@ from apt_evap.units import speed_from_energy
 ENERGY = 0.6  # eV
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip):
     """60 ions with responses, and flown at 0.6 eV."""
     simulation = ae.Simulation(small_tip, voltage=1000.0, seed=2)

@@ -21,7 +21,7 @@ FLOWN = (
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(tip12):
     return ae.Simulation(tip12, seed=5).run(120, FLOWN, progress=False)
 

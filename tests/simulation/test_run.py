@@ -31,7 +31,7 @@ class Hop:
         return ae.emission.Launches(where, push, np.zeros(len(emissions), bool))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(small_tip):
     return ae.Simulation(small_tip, seed=7).run(120, emissions=(*BUILT_IN, Hop()), progress=False)
 

@@ -19,17 +19,17 @@ ROLLED = ae.RollUp(0.2)
 DETECTOR = ae.Detector(distance=90.0, width=120.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def lens():
     return LocalElectrode(40e3, 20e3, 5.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(tip12, made_once):
     return made_once(tip12, 600, seed=3)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(run, lens):
     return run.at_evaporation_field(lens)
 
@@ -148,7 +148,7 @@ def test_the_image_compression_of_a_run_is_that_of_its_lens(large_run, lens):
     assert seen.compression > 1.3
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def large_run(nickel):
     tip = ae.Tip(nickel, 14 * nickel.a, axis=(1, 1, 1), offset_seed=2)
     return ae.Simulation(tip, seed=1, n_threads=1).run(4000, [ae.Unperturbed()], responses=False, progress=False)

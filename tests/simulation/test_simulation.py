@@ -45,7 +45,7 @@ def simulate(tip, n, *, batch_size=256, emissions=FLOWN, **options):
 PLAIN = 120  # ions
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def plain(small_tip):
     return simulate(small_tip, PLAIN, n_threads=1)  # past the first relaxation, which comes after 100 events
 
@@ -143,7 +143,7 @@ def test_ions_that_never_leave_are_counted(small_tip):
     assert run.hits(ae.LateralVelocity(0.1)).counts[ae.detection.Outcome.NEVER_LEFT] == 20
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def isolated_tip(nickel, small_tip):
     """An atom on its own over the apex, further than a nearest neighbour distance from all others."""
     d = small_tip.nearest_neighbour_distance

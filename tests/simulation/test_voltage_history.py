@@ -9,7 +9,7 @@ import apt_evap as ae
 from apt_evap.simulation.voltage_history import evaporation_fields, evaporation_voltages, smoothed_history
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def alloy(nickel):
     """A run of nickel and of a material of one's own, of another evaporation field but of the same name."""
     own = replace(nickel, evaporation_field=44.0)

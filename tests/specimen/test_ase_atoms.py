@@ -13,7 +13,7 @@ EXACT = 1e-12  # [nm] positions go through Angstrom and back: two roundings of n
 PLAIN = ae.evaporation.ChargeSettings(potential_bound=1.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def alloy():
     """A tip of two species, small enough for a text file."""
     return ae.Tip("Ni", apex_radius=2.0, axis=(1, 1, 1), shank_length=2.0, solutes={"Al": 0.01}, seed=4)
@@ -24,7 +24,7 @@ def charges_read(atoms):
     return atoms.arrays["charge"] if "charge" in atoms.arrays else atoms.get_charges()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def run(alloy):
     return ae.Simulation(alloy, seed=1, charge_settings=PLAIN).run(60, responses=False, progress=False)
 

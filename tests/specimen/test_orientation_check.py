@@ -15,7 +15,7 @@ from apt_evap.specimen import orientation_check
 from apt_evap.specimen.orientation_check import apex_sphere, bodies, depths, pointing, upright
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def needle(nickel):
     """Positions of a tip with a flat base, R = 2.5 nm, 8.5 nm high."""
     return ae.Tip(nickel, apex_radius=2.5, axis=(1, 1, 1), shank_length=6.0, shank_angle=6.0, base="flat").positions

@@ -25,7 +25,7 @@ REGIONS = [
 ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def points():
     return np.random.default_rng(1).uniform(-4, 4, (20_000, 3))
 

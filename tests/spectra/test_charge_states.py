@@ -181,7 +181,7 @@ def test_course_of_a_rising_field():
 # ---- a run, and its files ------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def real(small_tip, made_once):
     run = made_once(small_tip, 600, responses=False, seed=3)
     # a scale at which both charges are frequent

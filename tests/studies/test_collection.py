@@ -44,7 +44,7 @@ base = "base.toml"
 ROLLUP = ae.RollUp(ae.TruncatedNormal(0.155, 0.155))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sweep(tmp_path_factory):
     """A sweep of five points; all but the second are done."""
     sweep = planned(tmp_path_factory.mktemp("sweep"), STUDY, BASE)
@@ -53,7 +53,7 @@ def sweep(tmp_path_factory):
     return sweep
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def collected(sweep):
     return collect_sweep(sweep)
 

@@ -81,7 +81,7 @@ def check_same(one, other):
     assert filecmp.cmpfiles(one, other, names, shallow=False) == (names, [], [])
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def made(tmp_path_factory):
     """A plan whose runs are done, and the folder of its set."""
     folder = tmp_path_factory.mktemp("made")
@@ -383,7 +383,7 @@ def test_settings_come_back():
 # ---- wrong folders and files ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def other(tmp_path_factory):
     """Another data set, of another seed, with the same names of files: its plan and folder."""
     folder = tmp_path_factory.mktemp("other")

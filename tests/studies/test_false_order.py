@@ -8,7 +8,7 @@ from apt_evap._common.types import Estimated
 from apt_evap.studies.visibility.false_order import FalseOrder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def alloy(made_once):
     nickel = ae.material("Ni")
     phase = ae.specimen.Phase("alloy", nickel, solutes={"Al": 0.1}, evaporation_field=nickel.evaporation_field)

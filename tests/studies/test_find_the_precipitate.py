@@ -14,7 +14,7 @@ import apt_evap as ae
 ARTICLE = Path(__file__).parents[2] / "articles" / "find_the_precipitate"
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def baseline():
     return runpy.run_path(str(ARTICLE / "baseline.py"))
 

@@ -10,6 +10,7 @@ import scipy
 import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap.studies.visibility.cases import bottom_of, coordinates, simulated, specimen_of, varied
+from apt_evap.studies.visibility.operators import _moments
 from apt_evap.studies.visibility.probability import apparent_shape, permutation_p_value
 from apt_evap.studies.visibility.recorded import recorded_ions
 
@@ -24,19 +25,24 @@ def particle(size, fraction=0.5, ratio=1.0, radius=RADIUS):
     return ae.specimen.Phase("particle", "Ni", region, solutes={"Al": fraction}, evaporation_field=ratio * FIELD)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def tip():
     matrix = ae.specimen.Phase("matrix", "Ni", solutes={"Al": 0.05}, evaporation_field=FIELD)
     return ae.Tip(phases=[matrix], apex_radius=RADIUS, axis=(1, 1, 1), shank_length=RADIUS, seed=1)
 
 
-@pytest.fixture(scope="module")
-def operators(tip):
+@pytest.fixture(scope="session")
+def operators(tip, computed_once):
     """Of a particle with the field of the matrix, for two sizes."""
-    return ae.studies.origin_operators(particle(0.8), tip, EVERYTHING, axes={"size": [0.5, 0.9]}, n_threads=1)
+    arguments = particle(0.8), tip.settings, EVERYTHING, {"size": [0.5, 0.9]}
+
+    def compute():
+        return ae.studies.origin_operators(arguments[0], tip, EVERYTHING, axes=arguments[-1], n_threads=1)
+
+    return computed_once("operators", "studies", arguments, compute)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def ideal(operators):
     """The same for one size without errors: every atom arrives and appears at its site."""
     return replace(
@@ -311,6 +317,18 @@ def test_operators_are_not_extrapolated(operators, values):
     name = [*values][-1]
     with pytest.raises(ValueError, match=name):
         operators.emulate(1, **values)
+
+
+def test_ions_of_the_feature_and_of_its_surroundings_have_shifts_of_their_own(operators):
+    means, elements = np.zeros_like(operators.means), len(operators.elements)
+    means[:, :elements, ..., 2], means[:, elements:, ..., 2] = -0.2, 0.3
+    same = replace(operators, means=means, covariances=np.zeros_like(operators.covariances))
+    ions, feature = same.emulate(1, size=0.8), varied(*same._case(), size=0.8)[0]
+    assert (ions.inside == (feature.region.distance(ions.sites) <= 0)).all() and ions.inside.any()
+    # blurred by less than 1e-6 nm, so that the covariance has a factor
+    np.testing.assert_allclose((ions.positions - ions.sites)[:, 2], np.where(ions.inside, 0.3, -0.2), atol=1e-5)
+    again, _ = _moments(feature, ions, elements, RADIUS)
+    np.testing.assert_allclose(again, means[0], atol=1e-5)
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ FOUR = 'base = "base.toml"\n[sweep]\n"tip.offset_seed" = [1, 2]\n"simulation.see
 TWO = 'base = "base.toml"\n[sweep]\n"tip.offset_seed" = [1, 2]\n'
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     """A sweep of four points, all done."""
     sweep = planned(tmp_path_factory.mktemp("finished"), FOUR, SMALL)

@@ -107,7 +107,7 @@ def test_a_table_that_is_a_number_is_one_sentence(folder, capsys, options):
     assert "'wrong.toml': [simulation] must be a table" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def pair(small_tip, made_once):
     """A run, and what would have been measured of the same ions with other random numbers."""
     run = made_once(small_tip, 2000, seed=1, **ROUGH)[:1000]

@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.types import Booleans, Estimated, Floats, Integers
 from apt_evap._common.validation import (
     check_array,
@@ -166,10 +167,8 @@ class Visibility:
 
     def to_dict(self) -> dict[str, Any]:
         """Probability, N50, N95 and errors as numbers, None for NaN, for JSON."""
-        numbers = {"size": self.size, "significance": self.significance, "twins": len(self.p_values)}
-        parts = {name: getattr(self, name)._asdict() for name in ("probability", "n50", "n95")}
-        parts["errors"] = {name: number._asdict() for name, number in self.errors.items()}
-        return _finite(numbers | parts)
+        names = ("size", "significance", "probability", "n50", "n95", "errors")
+        return for_json({name: getattr(self, name) for name in names} | {"twins": len(self.p_values)})
 
     def _ions_for(self, probability):
         sized = self.sized
@@ -490,9 +489,3 @@ def _threshold(ions, is_found, probability):
         return math.nan
     value = centre + (math.log(probability / (1 - probability)) - offset) / slope
     return math.exp(value) if x.min() <= value <= x.max() else math.nan
-
-
-def _finite(value):
-    if isinstance(value, dict):
-        return {name: _finite(item) for name, item in value.items()}
-    return value if not isinstance(value, float) or math.isfinite(value) else None
