@@ -199,7 +199,7 @@ def short_range_order(
     places, labels = places[labels >= 0], labels[labels >= 0]
     low, high = (0.0, shell) if np.ndim(shell) == 0 else check_array(shell, "shell", (2,)).tolist()  # type: ignore[arg-type]
     check_number(low, "shell", at_least=0, unit="nm")
-    high = check_number(high, "shell", above=low, unit="nm")
+    high = check_number(high, "the second of shell", above=low, unit="nm")
     trials = check_count(trials, "trials", at_least=2)
     if len(np.unique(labels)) < 2:
         raise ValueError(f"species must be at least two of known ions, got {len(np.unique(labels))} of {len(places):,}")

@@ -293,7 +293,7 @@ def test_marks_of_a_wrong_form_are_refused():
         with pytest.raises(ValueError, match=name.rstrip("s")):
             marks_of(nickel, *marks)
     _, map = made("fcc", (0.30, 0.54, 0.79), ions=2_000)
-    with pytest.raises(ValueError, match="scales"):
+    with pytest.raises(ValueError, match=r"the second of scales must be .* >= 50, got 40"):
         quickly(map, "Ni", scales=(50.0, 40.0))
     with pytest.raises(ValueError, match="distance"):
         ae.index(map, "Ni", scales=(50.0, 60.0), distance=90.0)

@@ -683,7 +683,10 @@ def _scales(disc, scales, distance, start):
     name, factors = "scales", (1.0, 1.0)
     if scales is not None:
         low, high = check_array(scales, "scales", (2,)).tolist()
-        got = [check_number(low, name, above=0), check_number(high, name, at_least=low, unit="mm/rad")]
+        got = [
+            check_number(low, name, above=0),
+            check_number(high, "the second of scales", at_least=low, unit="mm/rad"),
+        ]
     elif distance is not None:
         name, factors = "distance", (LEAST_COMPRESSION, LARGEST_COMPRESSION)
         length = got = check_number(distance, name, above=0, unit="mm")

@@ -679,7 +679,7 @@ def _default_scales(simulated, fewest, ratio):
 def _range(value, name, **limits):
     low, high = (value, value) if np.ndim(value) == 0 else check_array(value, name, (2,)).tolist()
     low = check_number(low, name, **limits)
-    return low, check_number(high, name, at_least=low)
+    return low, check_number(high, f"the second of {name}", at_least=low)
 
 
 def _steps(ends, step):
