@@ -5,7 +5,8 @@
     python twins.py RUNS index Pt --draw 1 --maps 4 --ions 20000    # other maps, of 20,000 ions or more
     python twins.py RUNS bicrystals Pt --maps 2                     # two grains in a map, the second 5 to 50 % of it
     python twins.py RUNS structureless --maps 20                    # rings, gradients, stripes, spots
-    python twins.py RUNS lenses Pt --maps 10                        # scale and its error, of lenses of -20 to 20 %
+    python twins.py RUNS simulate Cu --long                         # a longer run, for lenses
+    python twins.py RUNS lenses Cu --maps 10                        # scale and its error, of lenses of -20 to 20 %
 
 The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
 symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
@@ -59,15 +60,23 @@ LENSES = (-0.2, -0.1, 0.0, 0.1, 0.2)
 """Relative displacements of the rim towards the centre."""
 CONE = math.radians(52)
 """Largest angle from the axis of a run of the ions that are used."""
+LONG = 60_000
+"""Ions of a long run."""
 
 
-def simulated(element):
+def path_of(runs, element, long):
+    """File of the run of a tip."""
+    return runs / f"{element}_{TIPS[element][0]}{'_long' if long else ''}.h5"
+
+
+def simulated(element, long):
     """Run of a tip along a random axis."""
     radius, rule, skip, ions, seed = TIPS[element]
     material = ae.material(element)
     size = radius * material.a
     axis = tuple(np.random.default_rng(seed).normal(size=3).tolist())
-    tip = ae.Tip(material, size, axis=axis, shank_length=size, depth=6 * material.a, offset_seed=seed)
+    depth = (12 if long else 6) * material.a
+    tip = ae.Tip(material, size, axis=axis, shank_length=size, depth=depth, offset_seed=seed)
     simulation = ae.Simulation(
         tip,
         seed=seed,
@@ -77,7 +86,7 @@ def simulated(element):
     )
     for _ in simulation.emitter.advance(skip):
         pass
-    return simulation.run(ions, progress=False)
+    return simulation.run(LONG if long else ions, progress=False)
 
 
 class Crystal:
@@ -127,7 +136,10 @@ class Crystal:
         return detector_map, projection, turn, f"emission {kind}, {math.degrees(half_angle):.0f} degrees"
 
     def through_lens(self, seed, change, least):
-        """A map through a lens, of 22 to 36 degrees, its projection, rotation, and what it is."""
+        """A map through a lens, of 22 to 36 degrees, its projection, rotation, and what it is.
+
+        An ion stands at one of its equal directions only, so that the noise is not symmetric.
+        """
         random = np.random.default_rng(seed)
         turn = Rotation.random(random_state=int(random.integers(1 << 31))).as_matrix()
         half_angle, scale = math.radians(random.uniform(22, 36)), random.uniform(30, 80)
@@ -135,8 +147,7 @@ class Crystal:
         kinds = [kind] if kind < len(EMISSIONS) else MIXTURES[kind - len(EMISSIONS)]
         share = random.uniform(0.2, 0.8, len(kinds)) if len(kinds) > 1 else np.ones(1)
         lens = ae.detection.Projection(scale, barrel=change / half_angle**2)
-        places = self.places(random, turn, kinds, share, lens, half_angle)
-        places = places[np.hypot(*places.T) < scale * half_angle * (1 - change)]
+        places = self.places_once(random, turn, kinds, share, lens, scale * half_angle * (1 - change))
         n = int(min(len(places), math.exp(random.uniform(math.log(least), math.log(60_000)))))
         places = places[random.permutation(len(places))[:n]]
         detector_map = ae.Hits(x=places[:, 0], y=places[:, 1]).map(bins=128)
@@ -144,17 +155,32 @@ class Crystal:
 
     def places(self, random, turn, kinds, share, projection, half_angle):
         """Places of the ions of a crystal with a rotation, with the same density in all directions."""
+        crystal = self._drawn(random, kinds, share)
+        crystal = np.concatenate([crystal @ member.T for member in self.group])
+        crystal = crystal[(crystal @ turn.T)[:, 2] > math.cos(min(1.25 * half_angle + 0.1, 1.3))]
+        return projection.places(crystal[random.random(len(crystal)) < self._chance(crystal)] @ turn.T)
+
+    def places_once(self, random, turn, kinds, share, projection, radius):
+        """The same within a radius [mm], but each ion at one of its places only."""
+        crystal = self._drawn(random, kinds, share)
+        places = np.stack([projection.places(crystal @ member.T @ turn.T) for member in self.group])
+        shown = np.hypot(*np.moveaxis(places, 2, 0)) < radius
+        number = shown.sum(axis=0)
+        kept = np.flatnonzero(random.random(len(crystal)) < self._chance(crystal) * number / number.max())
+        return places[(random.random(shown.shape) * shown).argmax(axis=0)[kept], kept]
+
+    def _drawn(self, random, kinds, share):
+        """Directions in the crystal of ions of a mixture of emissions, drawn for the same density at all radii."""
         parts = []
         for (directions, acceptance), part in zip((self.ions[k] for k in kinds), share, strict=True):
             parts.append(directions[random.random(len(directions)) < part * acceptance])
-        crystal = np.concatenate(parts)
-        crystal = np.concatenate([crystal @ member.T for member in self.group])
-        crystal = crystal[(crystal @ turn.T)[:, 2] > math.cos(min(1.25 * half_angle + 0.1, 1.3))]
-        # number of equal directions within the cone of the run: places with more have more ions
+        return np.concatenate(parts)
+
+    def _chance(self, crystal):
+        """Chance of directions to be used: where more equal ones are within the cone of the run there are more ions."""
         axis = self.orientation.matrix[2]
         covered = sum((crystal @ member @ axis > math.cos(CONE)).astype(int) for member in self.group)
-        chance = np.minimum(1, np.quantile(covered, 0.2) / np.maximum(covered, 1))
-        return projection.places(crystal[random.random(len(crystal)) < chance] @ turn.T)
+        return np.minimum(1, np.quantile(covered, 0.2) / np.maximum(covered, 1))
 
     def error(self, detector_map, candidate, *, projection, turn):
         """Median angle of true and found directions in the inner half [degrees], for the best equal crystal."""
@@ -250,6 +276,7 @@ def main():
     parser.add_argument("--maps", type=int, default=8, help="maps of each tip, or without structure")
     parser.add_argument("--ions", type=int, default=4_000, help="fewest ions of a map")
     parser.add_argument("--draw", type=int, default=0, help="other maps of the same tips")
+    parser.add_argument("--long", action="store_true", help="simulate the runs of `lenses`")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
     elements = options.elements or list(TIPS)
@@ -261,10 +288,10 @@ def main():
         return
     scales = []
     for element in elements:
-        path = options.runs / f"{element}_{TIPS[element][0]}.h5"
+        path = path_of(options.runs, element, options.long or options.what == "lenses")
         if options.what == "simulate":
             if not path.exists():
-                simulated(element).save(path)
+                simulated(element, options.long).save(path)
             continue
         crystal = Crystal(ae.load(path))
         material = crystal.orientation.material

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 import apt_evap as ae
 from apt_evap.maps.crystallography.directions import plane_normals
-from apt_evap.maps.indexing import joint_search
+from apt_evap.maps.indexing import index_map, joint_search, two_criteria
 from apt_evap.maps.indexing import orientation_search as polar_pictures
 from apt_evap.maps.indexing.contrast_search import picture_of, terms_of
 from apt_evap.maps.indexing.deciding_marks import deciding_marks
@@ -243,6 +243,25 @@ def test_the_error_of_the_scale_by_noise_is_its_scatter():
     # the error of a standard deviation of 24 is 15 %
     assert np.std(scales, ddof=1) == pytest.approx(np.median(errors), rel=0.45)
     assert np.mean(scales) == pytest.approx(SCALE, abs=3 * np.median(errors) / np.sqrt(24))
+
+
+def test_the_error_of_the_scale_is_what_patterns_of_other_radii_leave_open(monkeypatch):
+    """In a narrow view of one pole its size sets the scale, which a pattern of the right radius alone knows."""
+    monkeypatch.setattr(index_map, "terms_of", lambda material: None)
+    monkeypatch.setattr(index_map, "Terms", lambda material, patterns: None)
+    orientation, bounds = ae.Orientation("W", axis=(0, 1, 1.02), rotation=20.0), (SCALE / 2, 2 * SCALE)
+    patterns, width = master_patterns("bcc"), 2 * SCALE * np.radians(23)
+    map = patterns[1].map(orientation, ae.detection.Projection(SCALE), width, ions=20_000, rolled=0.5, seed=1)
+    disc = disc_of(map)
+    view = two_criteria.View(disc, bins_of(disc), np.zeros(0))
+    errors = []
+    for used in (patterns, patterns[1:2]):
+        crystal = index_map._Crystal(view, orientation.material, used, bounds, bounds)
+        fit, error = crystal.with_lens(refine(view.bins, disc, crystal.densities, orientation.matrix, SCALE))
+        assert fit.scale_at_centre == pytest.approx(SCALE, abs=2 * error)
+        errors.append((error, np.hypot(fit.scale_error, index_map.COMMON * fit.scale_at_centre)))
+    (by_all, noise), (by_one, noise_of_one) = errors
+    assert by_one == pytest.approx(noise_of_one) and by_all > 5 * by_one and noise < 2 * by_one
 
 
 def test_refinement_never_lowers_the_likelihood():
