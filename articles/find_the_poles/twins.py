@@ -7,6 +7,7 @@
     python twins.py RUNS structureless --maps 20                    # rings, gradients, stripes, spots
     python twins.py RUNS simulate Cu --long                         # a longer run, for lenses
     python twins.py RUNS lenses Cu --maps 10                        # scale and its error, of lenses of -20 to 20 %
+    python twins.py RUNS rim Cu --maps 20                           # ten of one grain, ten with 4 to 12 % of another
 
 The tips are not those of the master patterns: other metals or radii, other axes. The ions of a run are folded by the
 symmetry of the crystal, so that a map can show any axis: an ion stands at all its equal directions, and is drawn so
@@ -90,9 +91,10 @@ def simulated(element, long):
 
 
 class Crystal:
-    """Directions of the ions of a run in its crystal, for every emission."""
+    """Directions of the ions of a run in its crystal, for every emission; maps show them once, or all equal ones."""
 
-    def __init__(self, run):
+    def __init__(self, run, once=False):
+        self.once = once
         self.orientation = ae.Orientation.from_settings(run.settings["tip"])
         self.group = point_group(self.orientation.material.structure)
         real = run.at_evaporation_field()
@@ -155,6 +157,8 @@ class Crystal:
 
     def places(self, random, turn, kinds, share, projection, half_angle):
         """Places of the ions of a crystal with a rotation, with the same density in all directions."""
+        if self.once:
+            return self.places_once(random, turn, kinds, share, projection, 1.1 * half_angle * projection.scale)
         crystal = self._drawn(random, kinds, share)
         crystal = np.concatenate([crystal @ member.T for member in self.group])
         crystal = crystal[(crystal @ turn.T)[:, 2] > math.cos(min(1.25 * half_angle + 0.1, 1.3))]
@@ -270,13 +274,13 @@ def main():
     """Simulate, or index."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path, help="folder of the runs")
-    parser.add_argument("what", choices=("simulate", "index", "bicrystals", "structureless", "lenses"))
+    parser.add_argument("what", choices=("simulate", "index", "bicrystals", "structureless", "lenses", "rim"))
     parser.add_argument("elements", nargs="*", metavar="ELEMENT", help=", ".join(TIPS))
     parser.add_argument("--wrong", action="store_true", help="index as another crystal structure")
     parser.add_argument("--maps", type=int, default=8, help="maps of each tip, or without structure")
     parser.add_argument("--ions", type=int, default=4_000, help="fewest ions of a map")
     parser.add_argument("--draw", type=int, default=0, help="other maps of the same tips")
-    parser.add_argument("--long", action="store_true", help="simulate the runs of `lenses`")
+    parser.add_argument("--long", action="store_true", help="simulate the runs of `lenses` and `rim`")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
     elements = options.elements or list(TIPS)
@@ -288,12 +292,13 @@ def main():
         return
     scales = []
     for element in elements:
-        path = path_of(options.runs, element, options.long or options.what == "lenses")
+        once = options.what in ("lenses", "rim")
+        path = path_of(options.runs, element, options.long or once)
         if options.what == "simulate":
             if not path.exists():
                 simulated(element, options.long).save(path)
             continue
-        crystal = Crystal(ae.load(path))
+        crystal = Crystal(ae.load(path), once)
         material = crystal.orientation.material
         if options.what == "lenses":
             for number in range(options.maps):
@@ -306,6 +311,8 @@ def main():
             seed, second = 10_000 * options.draw + 100 * TIPS[element][4] + number, 0.0
             if options.what == "bicrystals":
                 seed, second = seed + 50, float(np.random.default_rng(seed + 50).uniform(0.05, 0.5))
+            if options.what == "rim" and 2 * number >= options.maps:
+                second = float(np.random.default_rng(seed).uniform(0.04, 0.12))
             detector_map, projection, turn, what = crystal.map(seed, options.ions, second)
             what += f", second grain {second:.2f}" if second else ""
             indexed(

@@ -12,7 +12,7 @@ from apt_evap._common.blas_threads import one_blas_thread
 from apt_evap.maps.indexing import halves_and_surrogates as module
 from apt_evap.maps.indexing import index_map
 from apt_evap.maps.indexing.contrast_search import PIECES, evidence, places_of, terms_of
-from apt_evap.maps.indexing.halves_and_surrogates import HALVES, Surrogates, second_grain, second_lattice
+from apt_evap.maps.indexing.halves_and_surrogates import HALVES, Surrogates, second_grain, second_lattice, unseen_grain
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.maps.indexing.orientation_search import AZIMUTHS, RINGS, disc_of, flattened_by_rings
 from apt_evap.maps.indexing.refine import directions_of, refine
@@ -78,6 +78,43 @@ def test_a_small_grain_at_the_rim_has_evidence_in_its_segment():
     view, fit = fit_of(both, orientation)
     found = second_grain(view, terms, fit)
     assert found.evidence > 40 and found.chord == 0.5 and found.azimuth == pytest.approx(90, abs=23)
+
+
+def with_another_grain_at_the_rim():
+    """A map of one grain, and the same map with another grain in 8 % of its area, towards 90 degrees."""
+    orientation, single = drawn((0.30, 0.54, 0.79))
+    _, other = drawn((0.1, 0.2, 0.97), 75.0, seed=2)
+    values = np.where(single.centres[1][:, None] > 0.74 * WIDTH / 2, other.values, single.values)
+    both = ae.DetectorMap.from_array(values, single.x_edges, single.y_edges, single.mask, is_counts=True)
+    return orientation, single, both
+
+
+def test_the_winner_is_not_seen_in_another_grain_at_the_rim():
+    """The evidence is that of weighted straight lines of the density in the segment, without and with the pattern."""
+    orientation, single, both = with_another_grain_at_the_rim()
+    densities = master_patterns("fcc")[0].smoothed(0.7)
+    view, fit = fit_of(single, orientation)
+    assert unseen_grain(view, densities, fit).evidence < -10
+    view, fit = fit_of(both, orientation)
+    found = unseen_grain(view, densities, fit)
+    assert found.evidence > 15 and found.chord == 0.74 and found.azimuth == pytest.approx(90, abs=16)
+    bins, azimuth = view.bins, np.radians(found.azimuth)
+    slow = np.exp(bins.slow @ fit.slow)
+    inside = bins.places @ (np.cos(azimuth), np.sin(azimuth)) > found.chord
+    directions = directions_of(bins.places, view.disc.radius, fit.scale, fit.stretch) @ fit.matrix
+    pattern = fit.amplitudes @ (module.sampled(densities, directions) - 1)
+    root = np.sqrt(slow[inside])
+    lines = np.column_stack([np.ones(inside.sum()), bins.places[inside]]) * root[:, None]
+    left = [np.linalg.lstsq(lines, (bins.counts / slow - 1 - model)[inside] * root)[1].item() for model in (0, pattern)]
+    assert found.evidence == pytest.approx((left[1] - left[0]) / fit.dispersion, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_grain_of_a_twelfth_at_the_rim_is_not_passed_over():
+    _, single, both = with_another_grain_at_the_rim()
+    assert quickly(single).decided
+    found = quickly(both)
+    assert not found.decided and "the pattern of this orientation is not seen" in found.reason
 
 
 def test_the_evidence_of_a_segment_is_the_direct_one(monkeypatch):

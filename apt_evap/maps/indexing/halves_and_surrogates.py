@@ -9,6 +9,9 @@ the winner are kept: its picture says what any orientation of the same crystal w
 logarithm of the likelihood ratio of the best other orientation and of the winner, both with these amplitudes, is the
 evidence of a second grain. In a grain of the winner its own lines are there, and the ratio is negative.
 
+**Rim.** In a smaller segment any orientation may seem likely, but the winner must be seen: its pattern of counts, with
+the amplitudes of the whole map, is compared with no pattern at all.
+
 **Surrogates.** A surrogate of a map has the same harmonics of every ring, but each harmonic with a random phase, the
 same for all rings and for counts and contrast. Rings, radial changes and the width of lines stay; what belongs to one
 crystal does not (J. Theiler et al., Physica D 58, 77 (1992)). The map must reach a larger weight than its surrogates,
@@ -43,6 +46,8 @@ _SCALES, _STRETCHES = (0.93, 1.0, 1.07), (1.0, 0.5)  # factors of its scale and 
 CHORDS, SEGMENTS = (0.0, 0.3, 0.5), 16
 """Distances of the chords beyond which segments of the disc are searched [radii], with 50, 31 and 20 % of its area, and
 azimuths of each. Beyond a chord at 0.65 radii measured nickel has 24, by the lens at its rim."""
+RIM_CHORDS, RIM_SEGMENTS = (0.59, 0.66, 0.74, 0.81), 24
+"""The same of the segments in which the winner must be seen, with 16, 12, 8 and 5 % of the area."""
 _SEGMENT_STEP = 3.0  # degrees: distance of neighbouring axes in the search of the segments
 _FREED, _SEGMENT_SCALES = (-2.0, 0.0, 2.0), (0.95, 1.0, 1.05)  # degrees and factors by which the winner is freed there
 _AT_ONCE = 40  # axes
@@ -160,10 +165,10 @@ def _sums_of_halves(values):
 
 
 class SecondGrain(NamedTuple):
-    """The segment of the disc in which another orientation is most likely."""
+    """The segment of the disc in which the winner is least likely."""
 
     evidence: float
-    """Twice the logarithm of the likelihood ratio of the best other orientation and the winner."""
+    """Twice the logarithm of the likelihood ratio of the best other orientation, or of no pattern, and the winner."""
     chord: float
     """Distance of the chord of the segment from the centre [radii]."""
     azimuth: float
@@ -236,6 +241,27 @@ def second_grain(view: View, terms: Terms, fit: Refined) -> SecondGrain:
     best = int(np.argmax(other - winner))
     chord, segment = divmod(best, SEGMENTS)
     return SecondGrain(float((other - winner)[best]), CHORDS[chord], math.degrees(azimuths[segment]))
+
+
+def unseen_grain(view: View, densities: Floats, fit: Refined) -> SecondGrain:
+    """Likelihood of the counts in a segment at the rim without the pattern of the winner; densities as of `refine`."""
+    _, bins, _ = view
+    slow = np.exp(np.clip(bins.slow @ fit.slow, -20, 20))
+    azimuths = np.arange(RIM_SEGMENTS) * (2 * math.pi / RIM_SEGMENTS)
+    toward = bins.places @ np.array([np.cos(azimuths), np.sin(azimuths)])
+    weights = np.array([np.where(along > chord, slow, 0.0) for chord in RIM_CHORDS for along in toward.T])
+    # slopes of the density in a segment are not the pattern: orthonormal ones, shape (segments, 3, n)
+    slopes = np.vstack([np.ones(len(slow)), bins.places.T])
+    roots = np.linalg.cholesky((slopes * weights[:, None]) @ slopes.T + 1e-9 * slow.sum() * np.eye(3))
+    slopes = np.linalg.solve(roots, slopes * weights[:, None])
+    contrast = bins.counts / slow - 1
+    image = np.tensordot(fit.amplitudes, densities, 1)[None]
+    directions = directions_of(bins.places, view.disc.radius, fit.scale, fit.stretch)
+    pattern = sampled(image, directions @ fit.matrix)[0] - fit.amplitudes.sum()
+    of_pattern, of_counts = slopes @ pattern, slopes @ contrast
+    gains = weights @ (pattern * (2 * contrast - pattern)) - (of_pattern * (2 * of_counts - of_pattern)).sum(axis=1)
+    chord, segment = divmod(int(gains.argmin()), RIM_SEGMENTS)
+    return SecondGrain(-float(gains.min() / fit.dispersion), RIM_CHORDS[chord], math.degrees(azimuths[segment]))
 
 
 def _correlations(spectra, others):

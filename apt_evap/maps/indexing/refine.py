@@ -82,6 +82,8 @@ class Refined:
     """Radial stretch b at the rim, positive for a barrel: r = scale_at_centre t (1 - b (t / t_rim)^2), angle t."""
     amplitudes: np.ndarray
     """Of the densities, shape (k,)."""
+    slow: np.ndarray
+    """Coefficients of the slow polynomials beside the pattern, shape (k,)."""
     gain: float
     """Decrease of the deviance by the pattern."""
     explained: float
@@ -409,6 +411,7 @@ def _refined(bins, likelihood, state, normal, marks):
         float(np.exp(state.geometry[3])),
         float(state.geometry[4]),
         state.amplitudes,
+        state.fit,
         bins.deviance - deviance(bins.counts, mu),
         1 - (pearson(bins.counts, mu) - freedom) / bins.structure if bins.structure > bins.structure_error else 0.0,
         dispersion * _correlated(bins, mu),
