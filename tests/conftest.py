@@ -34,7 +34,6 @@ import apt_evap as ae
 from apt_evap._common.codec import to_plain
 from apt_evap._common.files import replace_file
 from apt_evap.explore import measured_ions
-from apt_evap.io import measured_file
 from apt_evap.maps.indexing.master_pattern import master_patterns
 from apt_evap.simulation.locks import FileLock
 from apt_evap.spectra import mass_spectrum
@@ -246,7 +245,7 @@ def spectra_once(_spectra, monkeypatch):
             _spectra[key] = spectrum(hits, *args, **options)
         return _spectra[key]
 
-    for place in (ae, measured_file, measured_ions, mass_spectrum):
+    for place in (ae, measured_ions, mass_spectrum):
         monkeypatch.setattr(place, "spectrum", once)
 
 

@@ -3,7 +3,6 @@
 import hashlib
 import os
 import re
-import secrets
 import shutil
 import stat
 import sys
@@ -101,7 +100,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
         target = Path(os.path.realpath(path))
         mode = _mode_of(target)
         remove_abandoned(target)
-        name = target.with_name(f"{_before(target)}{secrets.token_hex(8)}.part")
+        name = target.with_name(f"{_before(target)}{os.urandom(8).hex()}.part")
         with open(name, "x+b") as file:
             part = name
             yield file
@@ -124,7 +123,7 @@ def replace_file(path: AnyPath) -> Iterator[BinaryIO]:
 def new_file(path: AnyPath) -> Iterator[BinaryIO]:
     """Write a file as `replace_file`, but replace nothing: FileError if there is something of this name at the end."""
     path = check_path(path)
-    part = path.with_name(f"{_before(path)}{secrets.token_hex(8)}.part")
+    part = path.with_name(f"{_before(path)}{os.urandom(8).hex()}.part")
     try:
         with replace_file(part) as file:
             yield file

@@ -4,7 +4,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from apt_evap._common.codec import declared, from_plain
 from apt_evap._common.files import FileError, read_small_file
@@ -12,16 +12,15 @@ from apt_evap.cli._output import say
 from apt_evap.cli._progress import reading_progress
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.hits import Hits
-from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.io.measured_file import MeasuredFile
-from apt_evap.maps.registration.register import Registration
-from apt_evap.simulation.config.lens_text import read_lens
-from apt_evap.simulation.config.material_text import read_material
 from apt_evap.simulation.read_file import read as read_file
 from apt_evap.simulation.run import Run, load
 from apt_evap.specimen.isotopes import ISOTOPES
-from apt_evap.workflows.compare_maps import MAX_STUDY
-from apt_evap.workflows.measured_source import MeasuredSource
+
+if TYPE_CHECKING:
+    from apt_evap.detection.microscope.local_electrode import LocalElectrode
+    from apt_evap.maps.registration.register import Registration
+    from apt_evap.workflows.measured_source import MeasuredSource
 
 
 def file_of(options: argparse.Namespace) -> MeasuredFile:
@@ -35,6 +34,8 @@ def file_of(options: argparse.Namespace) -> MeasuredFile:
     chosen = getattr(options, "all_ions", True) or file.mass is not None or file.species is not None
     if chosen or element is None or file.is_map:
         return file
+    from apt_evap.simulation.config.material_text import read_material
+
     name = read_material(element, "--element").name
     return replace(file, peaks=name) if name in ISOTOPES else file
 
@@ -82,9 +83,13 @@ def in_real_units(run: Run, options: argparse.Namespace) -> Run:
     return run.at_evaporation_field(lens, **({} if reference is None else {"field_reference": reference}))
 
 
-def lens_of(options: argparse.Namespace) -> LocalElectrode | None:
+def lens_of(options: argparse.Namespace) -> "LocalElectrode | None":
     """The lens of the options."""
-    return None if options.lens is None else read_lens(options.lens)
+    if options.lens is None:
+        return None
+    from apt_evap.simulation.config.lens_text import read_lens
+
+    return read_lens(options.lens)
 
 
 def note(text: str) -> None:
@@ -92,8 +97,11 @@ def note(text: str) -> None:
     say("note", text)
 
 
-def read_registration(text: str) -> Registration:
+def read_registration(text: str) -> "Registration":
     """Registration from a file (of a registration or a study), or from numbers."""
+    from apt_evap.maps.registration.register import Registration
+    from apt_evap.workflows.compare_maps import MAX_STUDY
+
     parts = text.split(",")
     try:
         mirror = parts[4:] == ["mirror"]
@@ -116,8 +124,10 @@ def read_registration(text: str) -> Registration:
         raise FileError(f"{text!r} does not contain a registration: {error}") from error
 
 
-def measured_source(options: argparse.Namespace) -> MeasuredSource:
+def measured_source(options: argparse.Namespace) -> "MeasuredSource":
     """The measured ions that the options select, or the measured map; read when they are needed."""
+    from apt_evap.workflows.measured_source import MeasuredSource
+
     file = file_of(options)
 
     def read_measured(path, **reading):

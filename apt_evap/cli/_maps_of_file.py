@@ -11,16 +11,9 @@ from apt_evap.cli._files import blocks_of, file_of, in_real_units, note, read
 from apt_evap.cli._output import say, tell
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.detection.projection import Projection
-from apt_evap.maps.crystallography.orientation import Orientation
-from apt_evap.maps.indexing.index_map import index
-from apt_evap.maps.indexing.orientation_search import disc_of
 from apt_evap.plot.map_figures import binned, binned_blocks, default_smoothing, specimen_title
-from apt_evap.simulation.apex import image_compression
-from apt_evap.simulation.config.material_text import read_material
 from apt_evap.simulation.config.perturbation_text import read_perturbation
-from apt_evap.simulation.ion_image import field_ion_image
 from apt_evap.simulation.run import Run
-from apt_evap.simulation.surface import surface_after
 from apt_evap.workflows.maps_of_run import phase_maps, run_maps, settings_of_maps
 
 _IMAGE_BINS = 512  # along a side of a field-ion image: a spot at R = 7 nm is 3 bins wide
@@ -83,6 +76,12 @@ def _map_of_large_file(options):
 
 def _crystal(content, options, title):
     """Title of the picture, and the orientation of the crystal and its projection: of a run, as given, or indexed."""
+    from apt_evap.maps.crystallography.orientation import Orientation
+    from apt_evap.maps.indexing.index_map import index
+    from apt_evap.maps.indexing.orientation_search import disc_of
+    from apt_evap.simulation.apex import image_compression
+    from apt_evap.simulation.config.material_text import read_material
+
     axis, rotation, scale = options.axis, options.rotation, options.scale
     if isinstance(content, Run):
         if options.poles or axis or rotation is not None:
@@ -122,6 +121,9 @@ def _crystal(content, options, title):
 
 def _field_ion_map(content, options):
     """Field-ion image of the surface at the end of a run, and its title."""
+    from apt_evap.simulation.ion_image import field_ion_image
+    from apt_evap.simulation.surface import surface_after
+
     if not isinstance(content, Run):
         raise ValueError(f"--field-ion needs a run (.h5), got {options.file!r}")
     for name in ("perturbation", "real_units", "lens"):

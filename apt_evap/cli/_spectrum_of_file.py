@@ -5,6 +5,8 @@ from typing import Any
 
 from apt_evap.cli._options import add_flight, add_reading
 
+_ALONE = "alone"  # column of the ions of a large file: whether an ion is the only one of its pulse
+
 
 def add_spectrum(parser: argparse.ArgumentParser) -> None:
     """Add the options of a spectrum."""
@@ -41,7 +43,8 @@ def abundances_of(texts: list[str] | None) -> dict[str, dict[int, float]] | None
 def spectrum_of(options: argparse.Namespace, ranges: Any = None, *, pulses: bool = False) -> Any:
     """The spectrum of the ions of FILE that the options select, of all or only of the ions of ranges.
 
-    Ions of a large file have only their masses, unless their pulses are needed.
+    Ions of a large file have only their masses, and which of them are alone in their pulse, unless all pulses are
+    needed.
     """
     from dataclasses import replace
 
@@ -75,38 +78,30 @@ def say_losses(options: argparse.Namespace, result: Any) -> None:
     """Say whether losses by dead time move the composition by more than its error."""
     from apt_evap.cli._output import say
 
-    if result.ranged or result.composition.refused:  # nothing to say: the pulses of a large file are not read
+    if result.ranged or result.composition.refused:
         return
-    if text := result.dead_time_note(_alone_of(options) if result.hits.pulse_id is None else None):
+    if text := result.dead_time_note(result.hits.extra.get(_ALONE)):
         say("note", text)
 
 
-def _alone_of(options):
-    """Whether each ion of a large file is the only one of its pulse, bool (n,); None if its pulses are not known."""
+def _masses_of_large_file(options):
+    """Masses of all ions of a large file, 4 bytes each, and which are alone in their pulse; None for another file.
+
+    Also without masses of detected ions. Pulses are not needed for ranges.
+    """
+    from apt_evap.cli._files import blocks_of
+
+    further = ("x", "y") if options.ranges is not None else ("x", "y", "pulse_id")
+    blocks = blocks_of(options, ("mass_to_charge",), further=further, without=("ranges",))
+    if blocks is None:
+        return None
+    hits = blocks.gathered("mass_to_charge", **({_ALONE: ("pulse_id", _alone)} if "pulse_id" in blocks.columns else {}))
+    return hits if (hits.detected & (hits.mass_to_charge > 0)).any() else None
+
+
+def _alone(pulse):
+    """Whether each ion of complete pulses is the only one of its pulse."""
     import numpy as np
 
-    from apt_evap.cli._files import blocks_of
-
-    blocks = blocks_of(options, ("pulse_id",), without=("ranges",))
-    if blocks is None:
-        return None
-    parts: list[Any] = []
-
-    class Alone:
-        def add(self, hits):
-            same = np.concatenate([[False], hits.pulse_id[1:] == hits.pulse_id[:-1], [False]])
-            parts.append(~(same[1:] | same[:-1]))
-
-    blocks.fed(Alone, "pulse_id")
-    return np.concatenate(parts)
-
-
-def _masses_of_large_file(options):
-    """Masses of all ions of a large file, 4 bytes each; None for another one, or without masses of detected ions."""
-    from apt_evap.cli._files import blocks_of
-
-    blocks = blocks_of(options, ("mass_to_charge",), further=("x", "y"), without=("ranges",))
-    if blocks is None:
-        return None
-    hits = blocks.gathered("mass_to_charge")
-    return hits if (hits.detected & (hits.mass_to_charge > 0)).any() else None
+    same = np.concatenate([[False], pulse[1:] == pulse[:-1], [False]])
+    return ~(same[1:] | same[:-1])

@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from apt_evap._common.notebook import as_picture
@@ -465,8 +464,32 @@ def masked_gaussian(values: Floats, mask: Booleans, sigmas: ArrayLike) -> Floats
 
 
 def gaussian(values: Floats, sigmas: ArrayLike, truncate: float = 4.0) -> Floats:
-    """Gaussian filter of maps of shape (..., ny, nx), with zeros outside; `sigmas` as for `masked_gaussian`."""
-    return scipy.ndimage.gaussian_filter(values, sigmas, mode="constant", truncate=truncate, axes=(-2, -1))
+    """Gaussian filter of maps of shape (..., ny, nx), with zeros outside; `sigmas` as for `masked_gaussian`.
+
+    It has the bits of ``scipy.ndimage.gaussian_filter``, whose import takes as long as a map.
+    """
+    smooth = np.array(values, dtype=float)
+    for axis, sigma in zip((-2, -1), np.broadcast_to(sigmas, 2), strict=True):
+        reach = int(truncate * sigma + 0.5)
+        if reach:
+            weights = np.exp(-0.5 / (sigma * sigma) * np.arange(-reach, reach + 1) ** 2)
+            for map in smooth.reshape(-1, *smooth.shape[-2:]).swapaxes(-2, axis):
+                _filter_columns(map, weights / weights.sum())
+    return smooth
+
+
+def _filter_columns(map, weights):
+    """Replace the columns of a map by their sums with symmetric weights; the far ones are added first, as by SciPy."""
+    reach, size = len(weights) // 2, len(map)
+    wide = np.zeros_like(map, shape=(size + 2 * reach, map.shape[1]))
+    wide[reach : reach + size] = map
+    map *= weights[reach]
+    pair = np.empty_like(map)
+    for first in range(reach):
+        last = 2 * reach - first
+        np.add(wide[first : first + size], wide[last : last + size], out=pair)
+        pair *= weights[first]
+        map += pair
 
 
 def _check_edges(edges, name, bins):

@@ -6,7 +6,7 @@ needed. Strays are looked for in the pass after it, together with the answer; on
 of all ions are read at once, and the answer is made again without them.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -177,11 +177,19 @@ class IonBlocks:
         self._warn_of_size(size, lambda: self.field.size)
         return consumer if self._strays is None else self.fed(make, *columns)
 
-    def gathered(self, *names: str) -> Hits:
-        """Columns of all ions, and their coordinates if some are not detected, because of which they are needed."""
-        gathered = self.fed(lambda: _Gathered(len(self), names if self.whole else (*names, *_PLACES)), *names)
+    def gathered(self, *names: str, **made: tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]) -> Hits:
+        """Columns of all ions, and their coordinates if some are not detected, because of which they are needed.
+
+        `made` are further columns, by name: the column that they are made of, and a function of it in a block.
+        """
+
+        def gathering():  # again once strays are found
+            return _Gathered(len(self), names if self.whole else (*names, *_PLACES), made)
+
+        gathered = self.fed(gathering, *names, *(column for column, _ in made.values()))
         columns: dict[str, Any] = gathered.columns
-        hits = Hits(**columns, source=self.source)
+        extra = {name: columns.pop(name) for name in made}
+        hits = Hits(**columns, extra=extra, source=self.source)
         if hits.x is not None and hits.y is not None:
             keep_strays(hits.x, hits.y, self._strays)
         return hits
@@ -219,14 +227,15 @@ class IonBlocks:
 class _Gathered:
     """Columns of all ions."""
 
-    def __init__(self, ions: int, names: tuple[str, ...]) -> None:
-        self._ions, self._names, self._at = ions, dict.fromkeys(names), 0
+    def __init__(self, ions: int, names: tuple[str, ...], made: Mapping[str, tuple[str, Callable[..., Any]]]) -> None:
+        self._ions, self._names, self._made, self._at = ions, dict.fromkeys(names), made, 0
         self.columns: dict[str, NDArray[Any]] = {}
 
     def add(self, hits: Hits) -> None:
         """Take the next block."""
-        for name in self._names:
-            values = getattr(hits, name)
+        values_of = {name: getattr(hits, name) for name in self._names}
+        values_of |= {name: function(getattr(hits, column)) for name, (column, function) in self._made.items()}
+        for name, values in values_of.items():
             if name not in self.columns:
                 self.columns[name] = np.empty((self._ions, *values.shape[1:]), values.dtype)
             self.columns[name][self._at : self._at + len(hits)] = values

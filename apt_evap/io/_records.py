@@ -209,10 +209,12 @@ def finite_rows(columns: Any, n: int) -> Any:
     finite = np.ones(n, bool)
     for _, values, dtype in columns:
         if values is not None and dtype == "f4":
-            with np.errstate(over="ignore"):
-                good = np.isfinite(values.astype(np.float32, copy=False))
-            for column in good.reshape(n, good.size // max(n, 1)).T:  # faster than `all` along rows of three
-                finite &= column
+            for start in range(0, n, _SURVEY):
+                part = values[start : start + _SURVEY]
+                with np.errstate(over="ignore"):
+                    good = np.isfinite(part.astype(np.float32, copy=False))
+                for column in good.reshape(len(part), -1).T:  # faster than `all` along rows of three
+                    finite[start : start + _SURVEY] &= column
     return finite
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.ion_blocks import IonBlocks
 from apt_evap.io import formats
 from apt_evap.io.distortion_grid import read_grid
-from apt_evap.spectra.mass_spectrum import Spectrum, spectrum
+
+if TYPE_CHECKING:
+    from apt_evap.spectra.mass_spectrum import Spectrum
 
 _ARRAYS = ("values", "x_edges", "y_edges", "mask")
 _OF_IONS = ("voltage_unit", "ions", "mass", "voltage", "circle", "box", "ranges", "species")
@@ -208,7 +210,7 @@ class MeasuredFile:
             return selection
         return self._in_peaks(selection, note)
 
-    def spectrum(self, read: Callable[..., Any] = formats.read) -> Spectrum | None:
+    def spectrum(self, read: Callable[..., Any] = formats.read) -> "Spectrum | None":
         """Spectrum of all ions, however their masses are selected; of the ranges, if there are; None without masses."""
         hits = self.load(read)
         if not isinstance(hits, Hits) or not self._knows_masses(hits.columns):
@@ -216,14 +218,14 @@ class MeasuredFile:
         ranges = None if self.ranges is None else formats.read_ranges(self.ranges)
         distance = self.distance if self._computes(hits.columns) else None
         every = replace(self, distance=None, mass=None, ranges=None, species=None, peaks=None)
-        return spectrum(every.select(hits), ranges=ranges, distance=distance, time_zero=self.time_zero)
+        return _spectrum(every.select(hits), ranges=ranges, distance=distance, time_zero=self.time_zero)
 
     def _in_peaks(self, hits, note):
         """The ions in the peaks of the element, and which ones they are as a note."""
-        made: list[Spectrum] = []
+        made: list[Any] = []
 
         def kept(*arguments, **options):
-            made.append(spectrum(*arguments, **options))
+            made.append(_spectrum(*arguments, **options))
             return made[0]
 
         try:
@@ -363,7 +365,14 @@ class MeasuredFile:
                 yield name, value
 
 
-_PACKAGE = SimpleNamespace(io=SimpleNamespace(read_grid=read_grid, read_ranges=formats.read_ranges), spectrum=spectrum)
+def _spectrum(*arguments, **options):
+    """`apt_evap.spectrum`: a map has none, and starts without its modules."""
+    from apt_evap.spectra.mass_spectrum import spectrum
+
+    return spectrum(*arguments, **options)
+
+
+_PACKAGE = SimpleNamespace(io=SimpleNamespace(read_grid=read_grid, read_ranges=formats.read_ranges), spectrum=_spectrum)
 """What the steps need of the package, which does not import itself."""
 
 

@@ -34,9 +34,6 @@ if TYPE_CHECKING:
 else:
     DrawnAxes = Axes
 
-if os.environ.get("APT_EVAP_DEFAULT_STYLE"):  # of a command: the settings of the user may need LaTeX
-    matplotlib.rcdefaults()
-
 # settings that are no style: backends and windows
 _NO_STYLE = ("backend", "interactive", "toolbar", "timezone", "webagg", "tk.", "savefig.directory", "date.epoch")
 _NO_STYLE += ("figure.raise_window", "figure.max_open_warning", "figure.hooks")
@@ -50,6 +47,8 @@ def _of_matplotlibrc():
 
 
 _CHANGED = _of_matplotlibrc()
+if _CHANGED and os.environ.get("APT_EVAP_DEFAULT_STYLE"):  # of a command: the settings of the user may need LaTeX
+    matplotlib.rcdefaults()
 
 
 def default_settings() -> Any:
@@ -101,7 +100,7 @@ def set_caption(ax: Axes, text: str) -> None:
     """Write a caption above the axes, as the label of an axis there: a title of any time comes above it."""
     above = ax.secondary_xaxis("top")
     above.set_xlabel(text, fontsize="small", color="0.35", labelpad=5, parse_math=False)
-    above.tick_params(length=0, pad=0, labeltop=False)
+    above.set_xticks([])
     above.spines["top"].set_visible(False)
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import scipy
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
-from scipy.ndimage import binary_fill_holes
 
 from apt_evap.detection.detector_map import DetectorMap
 from apt_evap.plot._figure import with_default_settings
@@ -29,7 +29,7 @@ def phase_outlines(
     for ax, whole, parts in zip(axes, maps, phases, strict=True):
         for name, part in parts.items():
             level = _level(part)
-            inside = binary_fill_holes(part.values >= level)  # such as the dark pole in its middle
+            inside = scipy.ndimage.binary_fill_holes(part.values >= level)  # such as the dark pole in its middle
             if np.count_nonzero(inside) > _LARGEST * np.count_nonzero(whole.values >= _level(whole)):
                 continue
             color = _COLORS[names.index(name) % len(_COLORS)]

@@ -14,6 +14,7 @@ from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
 from apt_evap.plot._figure import add_colorbar, interval_of_fraction, new_figure, set_title, with_default_settings
 from apt_evap.plot.map_figures import binned
+from apt_evap.reconstruction.cap_geometry import parts_of
 from apt_evap.reconstruction.consistency import density_near_axis
 from apt_evap.reconstruction.reconstructed import Reconstruction
 from apt_evap.spectra.mass_ranges import Ranges
@@ -27,7 +28,6 @@ FEWEST = 50
 """Fewest ions of a picture."""
 _LONG = 2.0  # depth over width of a reconstruction that is drawn with its depth from left to right
 _IN_LEGEND = 25  # points^2, of a dot
-_CORE = 0.5  # of the field of view, in which profiles are counted
 OUTSIDE = "outside every range"
 
 
@@ -143,7 +143,9 @@ def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str]
 
 def _side(ax: Axes, result, names, species, is_long):
     x, y, z = result.positions.T
-    near = np.flatnonzero(np.abs(y - np.median(y)) < 0.05 * np.ptp(y))
+    middle, height = np.median(y), result.extents[1]
+    near = [rows.start + np.flatnonzero(np.abs(y[rows] - middle) < 0.05 * height) for rows in parts_of(len(y))]
+    near = np.concatenate(near)
     near = near[:: max(1, -(-len(near) // _DOTS))]
     size = float(np.clip(_DOTS / max(len(near), 1), 1.5, 12.0))
     for number, name in enumerate(names):
@@ -157,7 +159,7 @@ def _side(ax: Axes, result, names, species, is_long):
     else:
         ax.invert_yaxis()  # the apex of the first ion above
         ax.set(aspect="equal", xlabel="x [nm]", ylabel="depth z [nm]")
-    set_title(ax, f"from the side, {0.1 * np.ptp(y):.1f} nm thick")
+    set_title(ax, f"from the side, {0.1 * height:.1f} nm thick")
 
 
 def _top(ax: Axes, result):
@@ -171,13 +173,6 @@ def _top(ax: Axes, result):
     add_colorbar([image], ax, label="ions per area / mean")
 
 
-def _core(result):
-    """Ions within half the field of view, and its radius [nm]."""
-    across = np.hypot(*result.positions[:, :2].T)
-    rim = _CORE * float(np.quantile(across, 0.99))
-    return across < rim, rim
-
-
 def _sections(values):
     """Edges of sections of equal width."""
     n = int(np.clip(len(values) // FEWEST, 1, _SECTIONS))
@@ -185,10 +180,10 @@ def _sections(values):
 
 
 def _density(ax: Axes, result):
-    near, rim = _core(result)
-    depths = result.depths  # from cap to cap, so that the curvature does not matter
-    edges = _sections(depths[near])
-    ions = np.histogram(depths[near], edges)[0]
+    near, rim = result.core
+    depths = result.depths[near]  # from cap to cap, so that the curvature does not matter
+    edges = _sections(depths)
+    ions = np.histogram(depths, len(edges) - 1, (edges[0], edges[-1]))[0]  # equal widths: without a search
     volume = np.pi * rim**2 * np.diff(edges)
     ax.errorbar(
         (edges[1:] + edges[:-1]) / 2, ions / volume, np.sqrt(ions) / volume, fmt=".-", color="C0", label="near the axis"
@@ -200,7 +195,7 @@ def _density(ax: Axes, result):
 
 
 def _fractions(ax: Axes, result, names, species):
-    near, _ = _core(result)
+    near, _ = result.core
     depths = result.positions[near, 2]
     # sections of equally many ions: the first and last ones of equal width have few, because the cap is curved
     edges = np.quantile(depths, np.linspace(0, 1, len(_sections(depths))))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from apt_evap.detection.microscope.lens import LAST_ANGLE
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.reconstruction.reconstruction_settings import ReconstructionSettings
 
-_PART = 1 << 15  # ions whose positions are computed at a time
+_PART = 1 << 15  # ions that are computed at a time: the temporary arrays stay in the cache
 _RIGHT_ANGLE = math.pi / 2
 _LAST_ON_LENS = math.radians(LAST_ANGLE)
 
@@ -92,15 +93,16 @@ class CapGeometry:
 
     def places(self, hits: Hits, radii: Floats) -> tuple[Floats, Floats]:
         """Place of each ion on the cap, x / R and y / R, shape (n, 2), and its angle on the cap [rad], shape (n,)."""
-        return self._places(hits, slice(None), radii, self.lens_voltages(hits))
+        columns, angles = self._places(hits, slice(None), radii, self.lens_voltages(hits))
+        return np.column_stack(columns), angles
 
     def _places(self, hits, rows, radii, voltages):
-        """`places` of some rows of the ions."""
+        """`places` of some rows of the ions, as columns."""
         x, y = (column[rows].astype(np.float64) for column in hits.require("x", "y"))
         rho = np.hypot(x, y)
         angles = self.angles(rho, radii, voltages)
         sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
-        return np.column_stack([sine_over_rho * x, sine_over_rho * y]), angles
+        return (sine_over_rho * x, sine_over_rho * y), angles
 
     def positions(self, hits: Hits, radii: Floats, shifts: Floats | None = None) -> Floats:
         """Positions of ions on caps of known radii.
@@ -123,18 +125,17 @@ class CapGeometry:
         swept, widening = self.cross_sections(radii, voltages)
         positions = np.empty((len(radii), 3))
         positions[:, 2] = _apex_depths(radii, self.volume, swept, widening)
-        # all at once with a lens; otherwise in parts, whose temporary arrays stay in the cache
-        step = _PART if self.lens is None else max(len(radii), 1)
-        for start in range(0, len(radii), step):
-            rows = slice(start, start + step)
+        # all at once with a lens
+        for rows in parts_of(len(radii)) if self.lens is None else [slice(None)]:
             places, angles = self._places(hits, rows, radii[rows], voltages)
             # depth below the apex in units of R, 1 - cos(theta)
             below = 2 * np.sin(angles / 2) ** 2
             if shifts is not None:
-                places = places + shifts[rows]
-                squares = np.minimum((places**2).sum(axis=1), 1.0)
+                places = places + shifts[rows].T
+                squares = np.minimum((places**2).sum(axis=0), 1.0)
                 below = squares / (1 + np.sqrt(1 - squares))
-            positions[rows, :2] = radii[rows, None] * places
+            for axis, place in enumerate(places):
+                positions[rows, axis] = radii[rows] * place
             positions[rows, 2] += radii[rows] * below
         return positions
 
@@ -164,8 +165,17 @@ def voltages_of(hits: Hits) -> Floats:
 
 def depths_below_apex(positions: Floats, radii: Floats) -> Floats:
     """Depth below the apex of ions on the cap [nm], shape (n,)."""
-    squares = positions[:, 0] ** 2 + positions[:, 1] ** 2
-    return squares / (radii + np.sqrt(np.maximum(radii * radii - squares, 0.0)))
+    below = np.empty(len(radii))
+    for rows in parts_of(len(radii)):
+        squares = positions[rows, 0] ** 2 + positions[rows, 1] ** 2
+        below[rows] = squares / (radii[rows] + np.sqrt(np.maximum(radii[rows] * radii[rows] - squares, 0.0)))
+    return below
+
+
+def parts_of(ions: int) -> Iterator[slice]:
+    """Rows of parts of the ions, whose temporary arrays stay in the cache."""
+    for start in range(0, ions, _PART):
+        yield slice(start, min(start + _PART, ions))
 
 
 def polar_angles(positions: Floats, radii: Floats) -> Floats:
@@ -186,10 +196,14 @@ def _cap_angles(ratios, projection, compression):
 
 def _apex_depths(radii, volume, swept, widening):
     """Depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
-    before, after = radii[:-1], radii[1:]
     # areas half way between two ions
     swept, widening = (area if np.ndim(area) == 0 else (area[:-1] + area[1:]) / 2 for area in (swept, widening))
-    squares = (before * before + before * after + after * after) / 3  # exact for dR proportional to dz
     depths = np.zeros(len(radii))
-    np.cumsum((volume / squares + widening * (after - before)) / swept, out=depths[1:])
+    for rows in parts_of(len(radii) - 1):
+        before, after = radii[:-1][rows], radii[1:][rows]
+        areas, losses = (area if np.ndim(area) == 0 else area[rows] for area in (swept, widening))
+        squares = (before * before + before * after + after * after) / 3  # exact for dR proportional to dz
+        steps = (volume / squares + losses * (after - before)) / areas
+        steps[0] += depths[rows.start]
+        np.cumsum(steps, out=depths[1:][rows])
     return depths

@@ -11,7 +11,6 @@ from apt_evap.reconstruction.calibration import distribution_map
 from apt_evap.reconstruction.reconstructed import Reconstruction
 
 _LEAST_AMPLITUDE = 0.05  # of planes that are resolved
-_CORE = 0.5  # of the field of view, in which the density is counted
 _GOOD = 0.05  # relative: a deviation that needs no attention
 
 
@@ -124,12 +123,10 @@ def _planes(reconstruction, name, place, spacing, width):
 
 def density_near_axis(reconstruction: Reconstruction) -> Check:
     """Ions per volume within half the field of view, against the efficiency over the atomic volume."""
-    settings, positions = reconstruction.settings, reconstruction.positions
+    settings = reconstruction.settings
     assert settings.atomic_volume is not None
     expected = settings.efficiency / settings.atomic_volume
-    across = np.hypot(positions[:, 0], positions[:, 1])
-    rim = _CORE * float(np.quantile(across, 0.99))
-    near = across < rim
+    near, rim = reconstruction.core
     # from cap to cap: the depth of the apex, so that the curvature does not matter
     depths = reconstruction.depths
     volume = math.pi * rim**2 * float(depths[-1] - depths[0])

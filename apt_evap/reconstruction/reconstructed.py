@@ -16,12 +16,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from apt_evap._common.types import Floats, Integers
+from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice
 from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.measures.interface import CompositionProfile
 from apt_evap.measures.point_cloud import Clusters, PointCloud
-from apt_evap.reconstruction.cap_geometry import CapGeometry, depths_below_apex, polar_angles, voltages_of
+from apt_evap.reconstruction.cap_geometry import CapGeometry, depths_below_apex, parts_of, polar_angles, voltages_of
 from apt_evap.reconstruction.density import CapDensity, density_of
 from apt_evap.reconstruction.errors import (
     FREE,
@@ -43,6 +43,7 @@ from apt_evap.simulation.run import Run
 FRAMES = ("depth", "specimen")
 """Direction of z: the depth, or out of the specimen."""
 
+_CORE = 0.5  # of the field of view
 _WIDEST = math.radians(89.0)  # rim of the field of view, at the largest compression that is fitted
 _FIT_IONS = 100_000  # of which radius and compression are fitted: errors of 1e-3 of those of an ion
 
@@ -106,6 +107,15 @@ class Reconstruction:
     def depths(self) -> Floats:
         """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
         return self.positions[:, 2] - depths_below_apex(self.positions, self.radii)
+
+    @cached_property
+    def core(self) -> tuple[Booleans, float]:
+        """Ions within half the field of view, where densities and profiles are counted, (n,), and its radius [nm]."""
+        across = np.empty(len(self))
+        for rows in parts_of(len(self)):
+            across[rows] = np.hypot(*self.positions[rows, :2].T)
+        rim = _CORE * float(np.quantile(across, 0.99))
+        return across < rim, rim
 
     @property
     def angles(self) -> Floats:
@@ -319,18 +329,21 @@ def cap_reconstruction(
 def _field_of_view(hits, settings):
     """Ions within the field of view, which of the hits these are, and its radius [mm]."""
     x, y = hits.require("x", "y")
-    rho = np.hypot(x, y, dtype=np.float64)
-    rows, radius = hits.detected, settings.detector_radius
-    if radius is not None:
-        with np.errstate(invalid="ignore"):
-            rows &= rho <= radius
+    rows, radius, farthest = hits.detected, settings.detector_radius, 0.0
+    for part in parts_of(len(hits)):
+        rho = np.hypot(x[part], y[part], dtype=np.float64)
+        if radius is None:
+            farthest = max(farthest, float(rho.max(where=rows[part], initial=0.0)))
+        else:
+            with np.errstate(invalid="ignore"):
+                rows[part] &= rho <= radius
     if not rows.any():
         where = "" if radius is None else f" within the detector_radius, got {radius:g} mm"
         raise ValueError(f"nothing to reconstruct: none of the {len(hits):,} ions hit the detector{where}")
     if settings.area is not None:
         rim = math.sqrt(settings.area / math.pi)
     else:
-        rim = float(rho.max(where=rows, initial=0.0)) if radius is None else radius
+        rim = farthest if radius is None else radius
     if rim == 0:
         raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
     return hits if rows.all() else hits[rows], rows, rim
@@ -366,7 +379,8 @@ def _radii_on_shank(n, settings, geometry):
 
 def _check_angles(hits, radii, geometry):
     """Raise an error if an ion or the rim of the field of view is too far from the axis of the cap."""
-    rim = max(geometry.field_of_view, float(np.hypot(hits.x, hits.y).max()))
+    farthest = [np.hypot(hits.x[part], hits.y[part]).max() for part in parts_of(len(hits))]
+    rim = max(geometry.field_of_view, float(np.max(farthest)))
     widest = float(np.max(geometry.angles(rim, radii, geometry.lens_voltages(hits))))
     limit = geometry.largest_angle
     if not widest < limit:  # also NaN

@@ -187,12 +187,16 @@ class Spectrum:
         return self._source.either
 
     @cached_property
+    def _inside(self):
+        """Which ions are counted, bool (n,)."""
+        return _inside(self.hits)
+
+    @cached_property
     def composition(self) -> Composition:
         """Composition in at.%, without one where more than 10 % of the ions in peaks are unexplained."""
-        mass = _detected(self.hits)
-        refused = ""
-        if len(mass) < FEWEST_OF_COMPOSITION:
-            refused = f"{len(mass):,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
+        ions, refused = int(np.count_nonzero(self._inside)), ""
+        if ions < FEWEST_OF_COMPOSITION:
+            refused = f"{ions:,} ions are too few, expected at least {FEWEST_OF_COMPOSITION}"
         return self._composition(self._source.amounts, self.unexplained_part, self.hits, refused)
 
     def composition_of(self, selection: Hits | NDArray[np.bool_]) -> Composition:
@@ -294,7 +298,8 @@ class Spectrum:
             (pulse,) = self.hits.require("pulse_id")
             _, place, number = np.unique(pulse, return_inverse=True, return_counts=True)
             alone = number[place] == 1
-        return self._source.losses(_detected(self.hits[alone]), _detected(self.hits[~alone]), self.composition)
+        (mass,) = self.hits.require("mass_to_charge")
+        return self._source.losses(mass[self._inside & alone], mass[self._inside & ~alone], self.composition)
 
     def dead_time_note(self, alone: NDArray[np.bool_] | None = None) -> str:
         """Sentence about losses by dead time that move the composition by more than its error, str.
@@ -590,9 +595,14 @@ def spectrum(
 
 def _detected(hits):
     """m/n of the detected ions between `LOWEST` and `HIGHEST` [Da]."""
+    return hits.require("mass_to_charge")[0][_inside(hits)]
+
+
+def _inside(hits):
+    """Which ions are detected with m/n between `LOWEST` and `HIGHEST`, bool (n,)."""
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
-        return mass[hits.detected & (mass > LOWEST) & (mass < HIGHEST)]
+        return hits.detected & (mass > LOWEST) & (mass < HIGHEST)
 
 
 def _without_mass(hits):
@@ -604,7 +614,8 @@ def _without_mass(hits):
 def _warn_of_masses(hits):
     (mass,) = hits.require("mass_to_charge")
     with np.errstate(invalid="ignore"):
-        wrong, heavy = mass[hits.detected & (mass < 0)], np.count_nonzero(hits.detected & (mass >= HIGHEST))
+        detected = hits.detected
+        wrong, heavy = mass[detected & (mass < 0)], np.count_nonzero(detected & (mass >= HIGHEST))
     if len(wrong):
         warn(
             f"mass_to_charge must be > 0 [Da], got {len(wrong):,} of {len(mass):,} ions down to {wrong.min():.4g}: "

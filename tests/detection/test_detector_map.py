@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -12,7 +13,7 @@ from apt_evap import plot
 from apt_evap.detection.binning import bin_edges, count, field_of_view, find_quantisation
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.detector import Detector
-from apt_evap.detection.detector_map import DetectorMap
+from apt_evap.detection.detector_map import DetectorMap, gaussian
 from apt_evap.detection.hits import Hits
 from apt_evap.io.formats import read
 from apt_evap.plot.map_figures import describe
@@ -245,6 +246,13 @@ def test_smoothing_is_a_gaussian_of_the_width_asked_for():
         # the filter is cut off at 4 sigma, which takes 0.1 % off its variance
         assert sigma == pytest.approx(1.5, rel=2e-3)
     assert map.smoothed(2.0).smoothing == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("sigmas", [(0.0, 40.0), (1.5, 9.0)], ids=["none and wide", "usual"])
+def test_the_filter_has_the_bits_of_scipy(sigmas):
+    for maps in (np.random.default_rng(3).random((2, 50, 30)), np.arange(12.0).reshape(3, 4)):
+        expected = scipy.ndimage.gaussian_filter(maps, sigmas, mode="constant", truncate=3.0, axes=(-2, -1))
+        np.testing.assert_array_equal(gaussian(maps, sigmas, 3.0), expected)
 
 
 def test_bad_arguments_are_named():

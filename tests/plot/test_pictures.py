@@ -170,7 +170,7 @@ def test_a_round_field_of_view_is_a_circle_and_a_run_has_a_title(run):
         for circle in drawn:  # the mean of 4,400 bins of 0.4 mm
             assert circle.center == pytest.approx((2, -1), abs=0.02) and circle.radius == pytest.approx(15, abs=0.02)
     (ax,) = plot.detector_maps([run.hits(ae.Unperturbed())], ["own"], title=specimen_title(run))
-    assert ax.get_title() == "own" and ax.figure.get_suptitle() == "Ni, axis [$111$], R = 2.1 nm"
+    assert ax.get_title() == "own" and ax.figure.get_suptitle() == "Ni, axis [111], R = 2.1 nm"
     assert_nothing_cut_off(ax.figure)
 
 

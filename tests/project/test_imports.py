@@ -64,6 +64,15 @@ def test_what_a_map_loads():
     assert first == set() and second == {"skimage.metrics"} and "skimage.morphology" in third
 
 
+@pytest.mark.slow
+def test_what_the_picture_of_a_run_loads(small_tip, made_once, tmp_path):
+    made_once(small_tip, 250, voltage=1000.0, seed=2).save(tmp_path / "run.h5")
+    found = loaded(HELP.format(["map", f"{tmp_path}/run.h5", "-o", f"{tmp_path}/map.png"]))
+    assert (tmp_path / "map.png").exists() and "matplotlib" in found
+    others = ("apt_evap.fit", "apt_evap.maps.indexing", "apt_evap.simulation.simulation")
+    assert found.intersection(SLOW + others) == set()
+
+
 def test_the_test_sees_what_is_loaded():
     assert {"matplotlib", "scipy.optimize"} <= loaded("import matplotlib, scipy.optimize")
 
