@@ -39,6 +39,10 @@ class Feature:
         Share of such ions in the matrix and in the feature: 0 and 1 for labels.
     ratio : float
         Its evaporation field relative to that of the matrix.
+    content_error : float
+        Standard error of its content.
+    neighbours : int
+        Ions that a membership is taken from; 1 for labels.
     """
 
     membership: Floats = field(repr=False)
@@ -46,6 +50,8 @@ class Feature:
     background: float
     content: float
     ratio: float
+    content_error: float = 0.0
+    neighbours: int = 1
 
     @property
     def members(self) -> Booleans:

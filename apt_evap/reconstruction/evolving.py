@@ -27,6 +27,7 @@ from apt_evap.reconstruction.local_composition import (
     CONTRAST_GATE,
     SoluteContrast,
     contents,
+    core_of,
     local_composition,
     local_share,
     noise_free_slopes,
@@ -71,11 +72,11 @@ _ION_LIMIT = 60_000  # in these passes; of more ions, every n-th
 _SPIN_UP = 0.05  # of the ions, from which nothing is measured: the first shape is not known
 _CLEAN = 0.02  # of the ions of a block: largest share of phases in a stretch of matrix
 _CLEAN_BLOCKS = 100
+_ALLOWED = 1.5  # standard deviations of its noise, for a stretch without gaps
 _FIELD_LIMITS = 0.5, 2.0  # of a phase relative to the matrix
 _FIELD_BIAS = 0.15  # of the difference to the matrix: by how much fields are found closer to 1, or farther
 _ION_LIMITS = 0.4, 2.5
 _CORE = 25  # neighbours for the core of a phase
-_CORE_SHARES = 0.92, 0.8, 0.6, 0.0  # of them: the first that leaves 100 ions
 _DENSITY_WIDTH = math.radians(3.0)  # of the Gaussian of the density on the detector
 _FOREIGN = 0.1  # of the ions of a cell: most that may be of another phase
 _DENSITY_BINS = 61
@@ -607,7 +608,7 @@ def _fixed_point(measured):
     if ions.growth > 0:
         trend = _trend(measured.voltages * ring.fields, _matrix(features), depths)
     voltages = measured.voltages / (trend[0] + trend[1] * depths)
-    level = _level(voltages, ring.fields, features, n)
+    level = _level(voltages, ring.fields, features, ions)
     start = nothing._replace(trend=trend, level=level, features=features, rim=rim)
     fixed = _found_by_passes(measured, start, surface, ring, voltages, seen, halves)
     if rough := [way for way in fixed.ways if way.way == "ring"]:
@@ -634,7 +635,7 @@ def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
         found = ring if by == "ring" else surface.integrate(voltages / level, thresholds, outside, by)
         values = found.fields * voltages / level
         compositions, features = _features(measured, seen, start.contrasts, halves, found.positions, ratios)
-        level = _level(voltages, found.fields, features, len(values))
+        level = _level(voltages, found.fields, features, ions)
         new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
         last, used, given = (used, given), ratios[seen], np.clip(new, *_FIELD_LIMITS)
         if last[0] is not None and np.abs(given - used).max() < _SETTLED:
@@ -683,10 +684,10 @@ def _features(measured, seen, contrasts, halves, positions, ratios):
             continue
         neighbours = contrasts[k].neighbours
         found = local_composition(positions, own, halves, neighbours, measured.ions.volume)
-        matrix, content = contents(found, neighbours)
+        matrix, content, error = contents(positions, own, halves, found, neighbours, measured.ions.volume)
         compositions.append(found)
         membership = (found.all - matrix) / (content - matrix)
-        features.append(Feature(membership, own, matrix, content, float(ratios[k])))
+        features.append(Feature(membership, own, matrix, content, float(ratios[k]), error, neighbours))
     return compositions, features
 
 
@@ -710,37 +711,40 @@ def _trend(values, weights, depths):
     return np.array([start, slope])
 
 
-def _clean_blocks(features, n):
-    """Block of each ion, and which blocks of the sequence are of matrix only."""
+def _clean_blocks(features, ions, allowed):
+    """Block of each ion, and which blocks of the sequence are of matrix only, but for some standard deviations."""
+    n, depth = len(ions.directions), ions.depths[-1]
     blocks = np.minimum(np.arange(n) * _CLEAN_BLOCKS // n, _CLEAN_BLOCKS - 1)
     counts = np.bincount(blocks, minlength=_CLEAN_BLOCKS)
     clean = np.ones(_CLEAN_BLOCKS, bool)
     for one in features:
-        noise = math.sqrt(one.background * (1 - one.background) / (n / _CLEAN_BLOCKS)) / (one.content - one.background)
+        # a mean over memberships, whose Gaussian reaches farther in depth than a block
+        counted = n * max((one.neighbours * ions.volume) ** (1 / 3) / depth, 1 / _CLEAN_BLOCKS)
+        noise = math.sqrt(one.background * (1 - one.background) / counted) / (one.content - one.background)
         share = np.bincount(blocks, np.clip(one.membership, 0, 1) if one.background == 0 else one.membership) / counts
-        clean &= share < _CLEAN + 1.5 * noise
+        clean &= share < _CLEAN + allowed * noise
     clean[: int(0.04 * _CLEAN_BLOCKS)] = False
     return blocks, clean
 
 
 def _matrix_rim(ions, features):
     """Flux at the rim over that of the whole view in stretches of matrix, if it is not that of a sphere; else None."""
-    blocks, clean = _clean_blocks(features, len(ions.directions))
+    blocks, clean = _clean_blocks(features, ions, 0.0)  # a mean: gaps do no harm, blocks of a phase do
     if not clean.any():
         return None
     rim = float(ions.in_ring[clean[blocks]].mean()) / ions.ring_part
     return rim if abs(rim - 1) > RIM_GATE else None
 
 
-def _level(voltages, at_ions, features, n):
+def _level(voltages, at_ions, features, ions):
     """Voltage of the matrix on a sphere: of the longest stretch of matrix, else such that V F of the matrix is 1."""
-    blocks, clean = _clean_blocks(features, n)
+    blocks, clean = _clean_blocks(features, ions, _ALLOWED)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], clean, [False]]).astype(int)))
     starts, stops = edges[::2], edges[1::2]
     if len(starts):
         longest = int((stops - starts).argmax())
         chosen = (blocks >= starts[longest]) & (blocks < stops[longest])
-        if chosen.sum() > 0.05 * n:
+        if chosen.sum() > 0.05 * len(voltages):
             return float(voltages[chosen].mean())
     weights = _matrix(features)
     return float((voltages * at_ions * weights).sum() / max(weights.sum(), 1e-9))
@@ -766,18 +770,14 @@ def _found_fields(measured, features, compositions, values, positions):
     matrix = _matrix(features)
     cores = []
     if measured.has_labels:
-        for one in features:
-            near = local_share(positions, one.own, _CORE, measured.ions.volume)
-            for share in _CORE_SHARES:
-                core = one.own & (near >= share)
-                if core.sum() > 100:
-                    break
-            cores.append(core)
+        near = [local_share(positions, one.own, _CORE, measured.ions.volume) for one in features]
+        cores = [core_of(one.own, share) for one, share in zip(features, near, strict=True)]
     best = ratios(later)
     left_out = np.array([ratios(later & (blocks != block)) for block in range(20)])
     with np.errstate(invalid="ignore"):
         scatter = np.sqrt(np.nansum((left_out - np.nanmean(left_out, axis=0)) ** 2, axis=0) * 19 / 20)
-    return best, np.hypot(scatter, _FIELD_BIAS * np.abs(best - 1))
+    counting = [one.content_error / (one.content - one.background) for one in features]
+    return best, np.sqrt(scatter**2 + ((best - 1) * np.hypot(_FIELD_BIAS, counting)) ** 2)
 
 
 def _placed(cap, measured, fixed, every, why, thinned):
@@ -801,6 +801,10 @@ def _placed(cap, measured, fixed, every, why, thinned):
     positions[:, 2] = ions.radius - positions[:, 2]  # depth below the apex of the first sphere
     numbers = {name: k for k, name in enumerate(measured.names)}
     known = fixed.contrasts or [SoluteContrast(0.0, 1.0, math.nan, 0)] * len(numbers)
+    seen = [k for k, one in enumerate(known) if not one.contrast < CONTRAST_GATE]
+    known = list(known)
+    for k, feature in zip(seen, fixed.features, strict=False):  # no features: no contrast was seen
+        known[k] = replace(known[k], matrix=feature.background, phase=feature.content)
     phases = tuple(
         PhaseField(
             name, float(fixed.ratios[k]), float(fixed.errors[k]), int(measured.own[k].sum()), known[k].matrix,

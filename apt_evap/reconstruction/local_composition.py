@@ -16,7 +16,8 @@ CONTRAST_GATE = 3.0
 _FEWEST, _MOST = 30, 250  # neighbours for a composition
 _NEIGHBOURS = 60  # for the contrast
 _CELLS = 1_500_000  # largest grid
-_CORE = 0.5  # of the ions in the richer half, that are taken for its core
+_CORE_SHARES = 0.92, 0.8, 0.6  # of the neighbours of an ion in the core of a phase
+_FEWEST_OF_CORE = 100
 _LEAST = 1e-9
 _TURNS = 60  # of the mixture of two binomials
 _SHARPNESS = 2.1  # cells per standard deviation of the Gaussian; wider cells would blur
@@ -121,21 +122,32 @@ def solute_contrast(positions: Floats, solute: Booleans, halves: Booleans, volum
     return SoluteContrast(matrix, phase, contrast, neighbours)
 
 
-def contents(found: LocalComposition, neighbours: int) -> tuple[float, float]:
-    """Content of the matrix by a mixture of two binomials, and of the core of the enriched phase.
+def contents(
+    positions: Floats, solute: Booleans, halves: Booleans, found: LocalComposition, neighbours: int, volume: float
+) -> tuple[float, float, float]:
+    """Content of the matrix and of the core of the enriched phase, and the standard error of the latter by its counts.
 
-    The mixture would take the blurred interface for part of the phase. The core is where one half of the neighbours is
-    richest; the other half, whose noise is independent, gives its content.
+    Other arguments as for `local_composition`. A mixture of two binomials takes the interface, which the Gaussian
+    blurs, for part of both. It only tells the richer ions of one half; where most neighbours are such or are not, the
+    ions of the other half, whose noise is independent, are counted.
     """
-    matrix, phase = _two_binomials(found.all, neighbours)
-    cores = []
-    for chooser, judge in ((found.first, found.second), (found.second, found.first)):
-        inside = chooser > (matrix + phase) / 2
-        if np.count_nonzero(inside) < _FEWEST:
-            return matrix, phase
-        core = inside & (chooser >= np.quantile(chooser[inside], 1 - _CORE))
-        cores.append(float(judge[core].mean()))
-    return matrix, max(phase, sum(cores) / 2)
+    mixture = _two_binomials(found.all, neighbours)
+    parts = [half > sum(mixture) / 2 for half in (found.first, found.second)]
+    ions, *near = _counted(positions, [np.ones(len(solute), bool), *parts], neighbours, volume)
+    counts = np.zeros((2, 2))  # of ions and of solutes, in the matrix and in the phase
+    for richer, richer_near, counted in zip(parts, near, (~halves, halves), strict=True):
+        share = richer_near / np.maximum(ions, _LEAST)
+        for place, core in enumerate((core_of(~richer, 1 - share), core_of(richer, share))):
+            counts[:, place] += np.count_nonzero(core & counted), np.count_nonzero(core & counted & solute)
+    matrix, core = counts[1] / np.maximum(counts[0], 1)
+    phase = max(float(core), mixture[1])  # what is too small to have a core
+    return float(matrix), phase, math.sqrt(phase * (1 - phase) / max(counts[0, 1], 1))
+
+
+def core_of(chosen: Booleans, near: Floats) -> Booleans:
+    """Those of chosen ions of whose neighbours a part is chosen: 92 %, or less until 100 ions are left, shape (n,)."""
+    cores = (chosen & (near >= share) for share in _CORE_SHARES)
+    return next((core for core in cores if np.count_nonzero(core) > _FEWEST_OF_CORE), chosen)
 
 
 def noise_free_slopes(values: Floats, found: list[LocalComposition]) -> Floats:

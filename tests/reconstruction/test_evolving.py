@@ -5,10 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fluxes import even_flux
+from scipy.ndimage import gaussian_filter1d
 
 import apt_evap as ae
 from apt_evap.reconstruction import evolving as module
-from apt_evap.reconstruction.evolving_surface import EvolvingSurface
+from apt_evap.reconstruction.beyond_view import Feature
+from apt_evap.reconstruction.evolving_surface import EvolvingSurface, IonSequence
+from apt_evap.reconstruction.local_composition import LocalComposition
 
 KNOWN = {"atomic_volume": 0.0166, "efficiency": 0.5, "distance": 100.0, "projection": "compressed", "compression": 1.0}
 HALF = 0.54  # rad
@@ -216,6 +219,54 @@ def test_a_voltage_that_changes_without_a_phase_is_left_to_the_cap():
     assert evolving(ions_of(8000, voltage=bump)[0]).verdict.startswith("cap: the voltage changes by")
     rise = 3000.0 * (1 + 0.3 * np.arange(8000) / 8000)
     assert evolving(ions_of(8000, voltage=rise)[0]).history is not None
+
+
+def weak(content, n=20_000):
+    """Sequence of even ions, and a solute of 2 % in the matrix as a feature, which has more in a tenth of the ions."""
+    rng = np.random.default_rng(5)
+    ions = IonSequence(even_flux(n, HALF), 0.033, HALF, 13.0)
+    inside = np.abs(np.arange(n) / n - 0.5) < 0.05
+    own = rng.random(n) < np.where(inside, content, 0.02)
+    # memberships are means over neighbours: over 0.05 of the sequence
+    share = gaussian_filter1d(own.astype(float), 0.05 * n / (2 * np.sqrt(np.pi)), mode="nearest")
+    neighbours = round((0.05 * ions.depths[-1]) ** 3 / ions.volume)
+    return ions, inside, Feature((share - 0.02) / (content - 0.02), own, 0.02, content, 1.1, 0.1 * content, neighbours)
+
+
+def test_the_flux_at_the_rim_is_that_of_blocks_without_a_weak_phase():
+    ions, inside, feature = weak(0.06)
+    for allowed, part in ((0.0, 0.4), (module._ALLOWED, 0.7)):
+        blocks, clean = module._clean_blocks([feature], ions, allowed)
+        # counted as if a block had only its own 200 ions, the noise would let through 0.39 of the phase
+        assert clean[blocks][inside].mean() < 0.01
+        assert clean.mean() > part * 0.85
+
+
+def test_blocks_that_may_be_of_a_phase_are_no_measure_of_the_flux_at_the_rim():
+    ions, _, feature = weak(0.06)
+    rim = np.sort(ions.in_ring)[::-1]  # all ions of the rim come first, with a phase that is less than its noise
+    membership = np.where(rim, 0.05, 0.0)
+    assert (
+        np.count_nonzero(module._clean_blocks([replace(feature, membership=membership)], ions, module._ALLOWED)[1]) > 90
+    )
+    ions = replace(ions, directions=ions.directions[np.argsort(~ions.in_ring, kind="stable")])
+    assert module._matrix_rim(ions, [replace(feature, membership=membership, neighbours=1)]) == 0.0
+
+
+def test_a_field_is_as_sure_as_the_content_that_it_is_said_for():
+    ions, _, feature = weak(0.2)
+    rng = np.random.default_rng(6)
+    values = 1 + 0.1 * feature.membership + 0.01 * rng.standard_normal(len(feature.own))
+    found = LocalComposition(*[0.02 + 0.18 * feature.membership] * 3)
+    measured = module._Measured(ions, values, ("Cu",), (feature.own,), False, 0)
+    errors = []
+    for content_error in (0.0, 0.09):
+        one = replace(feature, content_error=content_error)
+        (ratio,), (error,) = module._found_fields(measured, [one], [found], values, None)
+        assert ratio == pytest.approx(1.1, abs=0.01)
+        errors.append(error)
+    # half of the contrast: half of the difference to the matrix
+    assert np.sqrt(errors[1] ** 2 - errors[0] ** 2) == pytest.approx(0.05, rel=0.1)
 
 
 @pytest.mark.slow

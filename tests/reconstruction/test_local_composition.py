@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from apt_evap.reconstruction.beyond_view import Feature, continued
-from apt_evap.reconstruction.local_composition import local_composition, noise_free_slopes, solute_contrast
+from apt_evap.reconstruction.local_composition import (
+    contents,
+    core_of,
+    local_composition,
+    noise_free_slopes,
+    solute_contrast,
+)
 
 VOLUME = 0.033  # nm^3 per detected ion
 
@@ -42,6 +48,31 @@ def test_a_contrast_is_seen_if_it_is_larger_than_its_noise(phase, is_seen):
         assert contrast.contrast > 10
     else:
         assert abs(contrast.contrast) < 2.5  # standard normal without a contrast
+
+
+@pytest.mark.parametrize("phase", [0.06, 0.2, 0.4])
+def test_contents_are_those_of_the_matrix_and_the_phase_without_their_interface(phase):
+    differences = []
+    for seed in range(3):
+        positions, _, solute, halves = alloy(0.02, phase, n=20_000, seed=seed)
+        neighbours = solute_contrast(positions, solute, halves, VOLUME).neighbours
+        found = local_composition(positions, solute, halves, neighbours, VOLUME)
+        matrix, content, error = contents(positions, solute, halves, found, neighbours, VOLUME)
+        assert matrix == pytest.approx(0.02, abs=0.004)  # 4 standard deviations of 15,000 ions
+        # the layer has 7,300 ions; its core of neighbours has half of them or less, each counted once
+        assert np.sqrt(phase * (1 - phase) / 7300) < error < np.sqrt(phase * (1 - phase) / 400)
+        differences.append((content - phase) / error)
+    # a mixture of two binomials alone gives 0.17 to 0.18 for 0.2, and 0.35 to 0.36 for 0.4
+    assert abs(np.mean(differences)) < 1.5 and np.abs(differences).max() < 3.5
+
+
+def test_a_core_has_neighbours_of_its_own_kind_or_as_many_as_leave_a_hundred_ions():
+    near = np.repeat([0.95, 0.85, 0.3], [150, 150, 700])
+    few = np.where(near > 0.9, near - 0.1, near)
+    chosen = np.arange(1000) % 10 < 9
+    assert np.count_nonzero(core_of(chosen, near)) == 135
+    assert np.count_nonzero(core_of(chosen, few)) == 270
+    np.testing.assert_array_equal(core_of(chosen, near / 2), chosen)
 
 
 def test_slopes_have_no_bias_by_the_noise_of_the_counts():
