@@ -21,7 +21,7 @@ from apt_evap._common.validation import check_array, check_number, check_sequenc
 from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.reconstruction.beyond_view import FLAT_GATE, Continuation, Feature, continued
 from apt_evap.reconstruction.cap_geometry import voltages_of
-from apt_evap.reconstruction.evolving_surface import DEPTH_WINDOW, EvolvingSurface, IonSequence, SurfacePass
+from apt_evap.reconstruction.evolving_surface import DEPTH_WINDOW, EvolvingSurface, IonSequence, SurfacePass, mean_pass
 from apt_evap.reconstruction.found_region import found_tip
 from apt_evap.reconstruction.local_composition import (
     CONTRAST_GATE,
@@ -57,7 +57,7 @@ planes of Fe [001], 0.007 for spheres, 0.033 for a layer of 1.15 times the field
 RIM_GATE = 0.09
 """Largest difference to 1 of the flux at the rim over that of the whole view in stretches of matrix: 0.00 to 0.08 in
 views of 30 and 35 degrees of aluminium with spheres, 0.09 to 0.13 in 25 degrees. Beyond, it is that of the crystal, and
-depths are 0.33 in place of 0.07 nm (sphere of 0.8)."""
+depths by it alone are 0.33 in place of 0.07 nm (sphere of 0.8)."""
 
 VOLTAGE_ERROR = 0.017
 """Relative error of V F = F_evap: RMS of V F / F_evap - 1 in the matrix of a pure specimen and of three with spheres,
@@ -247,7 +247,7 @@ class EvolvingReconstruction(Reconstruction):
 
     @property
     def followed_by(self) -> str:
-        """What the recession follows from: the "volume" of the ions without a phase, the "ring", or the "surface"."""
+        """What the recession follows from: the "volume" without a phase, the "ring", the "surface", or "both"."""
         return self._followed[1].way  # type: ignore[no-any-return]
 
     @property
@@ -287,7 +287,7 @@ class EvolvingReconstruction(Reconstruction):
         measured, fixed = self._followed
         surface = EvolvingSurface(ions)
         by = by or fixed.way
-        if by != "surface":
+        if by not in ("surface", "both"):
             return surface.integrate(recession=by).positions
         depths = measured.ions.depths[1:]
         voltages = (voltage * measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level)[rows]
@@ -299,15 +299,17 @@ class EvolvingReconstruction(Reconstruction):
         fields = fixed.fields[rows] + sum(change * one.membership for one, change in zip(features, added, strict=True))
         places = fixed.positions[rows] if features else ions.directions  # of no phase nothing is continued
         for _ in range(2):  # the phases where these ions were found, then where those of the changed sequence are
-            outside = continued(features, places, ions.in_ring)[0]
+            outside, ways = continued(features, places, ions.in_ring)
             places = surface.integrate(voltages, fields, outside, "surface").positions
-        return places
+            if all(one.way == "none" for one in ways):
+                break
+        return (places + surface.integrate(rim=fixed.rim).positions) / 2 if by == "both" else places
 
     def recession_changes(self) -> list[Floats]:
         """What the recession of the sphere is not sure about: changes of the positions of `sequence` [nm].
 
         By `VOLTAGE_ERROR`, and by the evaporation field of each phase, one standard error of it; without phases at the
-        rim of the field of view by the voltage, which tells of the recession a second time.
+        rim of the field of view by the voltage alone, which is one of two measures, or tells of it a second time.
         """
         ions, measured = self.sequence, self._followed[0]
         known = self.followed_by == "volume" or any(one.error == one.error for one in self.phases)
@@ -317,7 +319,7 @@ class EvolvingReconstruction(Reconstruction):
         if self.followed_by == "volume":
             level = float(np.mean(measured.voltages * EvolvingSurface(ions).integrate(recession="volume").fields))
             return [self.again(ions, voltage=1 / level, by="surface") - usual]
-        if self.followed_by == "ring":
+        if self.followed_by in ("ring", "both"):
             return [self.again(ions, by="surface") - usual]
         errors = np.diag([one.error for one, _ in self.found_features])
         return [self.again(ions, voltage=1 + VOLTAGE_ERROR) - usual] + [
@@ -625,14 +627,19 @@ def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
     ions, level, ratios, features, found = measured.ions, start.level, start.ratios, start.features, ring
     errors = np.zeros(len(ratios))
     used = given = None
+    by_rim = ring if start.rim is None else surface.integrate(rim=start.rim)
     for _ in range(_PASSES):
         features = [replace(one, ratio=float(ratios[k])) for one, k in zip(features, seen, strict=True)]
         outside, ways = continued(features, found.positions, ions.in_ring)
         before, thresholds = found.positions, _ion_fields(features)
         # Without a phase at the rim the flux there is the better measure: depths 0.148 in place of 0.167 nm, and 16 in
-        # place of 17 % on the wrong side, of a sphere of 1.2 times the field. It does not depend on the fields.
-        by = "ring" if start.rim is None and all(one.way == "none" for one in ways) else "surface"
-        found = ring if by == "ring" else surface.integrate(voltages / level, thresholds, outside, by)
+        # place of 17 % on the wrong side, of a sphere of 1.2 times the field. It does not depend on the fields. It is
+        # that of the crystal where either may be the better one: then their mean.
+        inside = all(one.way == "none" for one in ways)
+        by = "surface" if not inside else "ring" if start.rim is None else "both"
+        found = ring if by == "ring" else surface.integrate(voltages / level, thresholds, outside, "surface")
+        if by == "both":
+            found = mean_pass(found, by_rim)
         values = found.fields * voltages / level
         compositions, features = _features(measured, seen, start.contrasts, halves, found.positions, ratios)
         level = _level(voltages, found.fields, features, ions)
@@ -791,7 +798,9 @@ def _placed(cap, measured, fixed, every, why, thinned):
         voltages = measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level
         part = ions.part(0, every) if every > 1 else ions
         outside = continued(fixed.features, fixed.positions, part.in_ring)[0]
-    found = surface.integrate(voltages, thresholds, outside, fixed.way)
+    found = surface.integrate(voltages, thresholds, outside, "surface" if fixed.way == "both" else fixed.way)
+    if fixed.way == "both":
+        found = mean_pass(found, surface.integrate(rim=fixed.rim))
     edges = found.steps.first_ions
     means = np.full(len(edges) - 1, np.nan)
     if voltages is not None:
@@ -851,6 +860,9 @@ def _verdict(fixed, measured, why):
     if fixed.way == "ring":
         because = f", {why}" if why and measured.names else ""
         return f"followed by the flux at the rim: at most {share:.2f} of it is of a phase{because}{jumps}"
+    if fixed.way == "both":
+        measures = f"of voltage and phases and of the flux at the rim{crystal}"
+        return f"followed by the mean {measures}: at most {share:.2f} of the rim is of a phase{jumps}"
     how = {way.way for way in fixed.ways} - {"none"}
     ways = {"plane": "continued as a plane", "ring": "continued from the ions at its azimuth"}
     beyond = f", {' and '.join(ways[way] for way in sorted(how))}" if how else ""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -157,6 +157,13 @@ class SurfacePass(NamedTuple):
     steps: SurfaceSteps
 
 
+def mean_pass(first: SurfacePass, second: SurfacePass) -> SurfacePass:
+    """Mean of two passes over the same ions, by two measures of the recession."""
+    means: list[Any] = [(one + other) / 2 for one, other in zip(first.steps[1:], second.steps[1:], strict=True)]
+    positions, fields, depths = ((one + other) / 2 for one, other in zip(first[:3], second[:3], strict=True))
+    return SurfacePass(positions, fields, depths, SurfaceSteps(first.steps.first_ions, *means))
+
+
 class EvolvingSurface:
     r"""Integrates the shape of a surface from the ions that leave it.
 
@@ -206,6 +213,7 @@ class EvolvingSurface:
         fields: Floats | None = None,
         outside: Callable[[Floats], Floats] | None = None,
         recession: str = "ring",
+        rim: float = 1.0,
     ) -> SurfacePass:
         """Integrate the shape, and place the ions.
 
@@ -222,6 +230,8 @@ class EvolvingSurface:
             cap that keeps its shape, by the volume of the ions, which lie on this sphere in the directions that they
             come from. "surface": such that the mean of V F / F_evap stays 1, and the surface beyond evaporates by its
             own field.
+        rim : float
+            Flux in the ring over that of an even one while only matrix evaporates, for "ring".
 
         Returns
         -------
@@ -236,7 +246,7 @@ class EvolvingSurface:
         steps = max(1, math.ceil(nominal[-1] / self.step))
         edges = np.searchsorted(nominal, np.linspace(0, nominal[-1], steps + 1))
         edges[0], edges[-1] = 0, n
-        ring = self._ring_flux(edges, nominal)
+        ring = self._ring_flux(edges, nominal) / rim
         apex = np.empty(n)
         kept = np.zeros((5, steps))
         shapes = np.empty((steps, degrees[-1] + 1, degrees[-1] + 1), np.complex128)

@@ -58,10 +58,12 @@ def test_a_flux_at_the_rim_that_no_phase_explains_is_that_of_the_crystal():
     # followed as where a phase is seen, the sphere would sink by 0.88 of it
     by_rim = EvolvingSurface(found.sequence).integrate()
     assert by_rim.apex_depths[-1] / found.depths[-1] == pytest.approx(0.88, abs=0.01)
+    relative = EvolvingSurface(found.sequence).integrate(rim=0.88)
+    np.testing.assert_allclose(relative.apex_depths, by_rim.apex_depths / 0.88, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("left_out", "way"), [(16, "ring"), (6, "surface")])
-def test_with_a_phase_inside_the_rim_is_followed_if_the_matrix_is_even_there(left_out, way):
+@pytest.mark.parametrize(("left_out", "way"), [(16, "ring"), (6, "both")])
+def test_with_a_phase_inside_the_rim_is_followed_if_the_matrix_is_even_there_else_its_mean_with_voltage(left_out, way):
     hits, _ = ions_of(8000, voltage=varying(8000))
     rim = np.hypot(hits.x, hits.y) > 100 * np.tan(0.82 * HALF)
     hits = hits[~rim | (np.cumsum(rim) % left_out > 0)]
@@ -69,7 +71,14 @@ def test_with_a_phase_inside_the_rim_is_followed_if_the_matrix_is_even_there(lef
     ball = (np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 0.8).astype(int)
     found = evolving(hits, labels=ball)
     assert found.followed_by == way
-    assert ("the flux is that of the crystal, 0.88 of the view" in found.verdict) == (way == "surface")
+    assert ("the flux is that of the crystal, 0.88 of the view" in found.verdict) == (way == "both")
+    rim = found._followed[1].rim or 1.0
+    assert rim == pytest.approx(1.0 if way == "ring" else 0.88, abs=0.01)
+    (change,) = found.recession_changes()  # to the voltage alone: of two measures, half of their difference
+    by_rim = EvolvingSurface(found.sequence).integrate(rim=rim).positions - [0, 0, 13.0]
+    by_mean = by_rim if way == "ring" else by_rim + change
+    np.testing.assert_allclose(found.specimen_positions, by_mean, atol=1e-9)
+    assert np.abs(change[:, 2]).max() > 0.001
     # without a voltage nothing tells more than the volume
     plain = evolving(replace(hits, voltage=None), labels=ball)
     assert plain.followed_by == ("ring" if way == "ring" else "volume")
@@ -321,9 +330,9 @@ def test_passes_are_as_many_as_the_fields_need(monkeypatch, reaches):
         labels = (np.linalg.norm(places - (0.0, 0.0, places[:, 2].mean()), axis=1) < 1.5).astype(int)
     ways, plain = [], EvolvingSurface.integrate
 
-    def counted(surface, voltages=None, fields=None, outside=None, recession="ring"):
+    def counted(surface, voltages=None, fields=None, outside=None, recession="ring", rim=1.0):
         ways.append(recession)
-        return plain(surface, voltages, fields, outside, recession)
+        return plain(surface, voltages, fields, outside, recession, rim)
 
     def halfway(measured, features, compositions, values, positions):
         return np.array([(features[0].ratio + 1.16) / 2]), np.array([0.01])
