@@ -468,7 +468,7 @@ def gaussian(values: Floats, sigmas: ArrayLike, truncate: float = 4.0) -> Floats
 
     It has the bits of ``scipy.ndimage.gaussian_filter``, whose import takes as long as a map.
     """
-    smooth = np.array(values, dtype=float)
+    smooth = np.array(values, dtype=float, order="C")  # whose maps are views
     for axis, sigma in zip((-2, -1), np.broadcast_to(sigmas, 2), strict=True):
         reach = int(truncate * sigma + 0.5)
         if reach:
