@@ -45,8 +45,7 @@ class Processes:
         return int(self._parent.stdout.readline())
 
     def close(self):
-        self._parent.stdin.close()
-        self._parent.wait()
+        self._parent.communicate()  # closes its pipes and waits
 
 
 @pytest.fixture(scope="session")
