@@ -243,18 +243,24 @@ class EvolvingReconstruction(Reconstruction):
     @property
     def sequence(self) -> IonSequence:
         """Ions of the passes in which the fields were found: every n-th of many."""
-        return self._followed[0].ions  # type: ignore[no-any-return]
+        return self._passes()[0].ions  # type: ignore[no-any-return]
 
     @property
     def followed_by(self) -> str:
-        """What the recession follows from: the "volume" without a phase, the "ring", the "surface", or "both"."""
-        return self._followed[1].way  # type: ignore[no-any-return]
+        """What the recession follows from: "volume" without a phase, "ring", "surface" or "both"; "cap" if nothing."""
+        return "cap" if self._followed is None else self._followed[1].way
 
     @property
     def found_features(self) -> list[tuple[PhaseField, Feature]]:
         """Each of `phases` whose contrast was seen, and its ions of `sequence`."""
         seen = [one for one in self.phases if not one.contrast < CONTRAST_GATE]
-        return list(zip(seen, self._followed[1].features, strict=True))
+        return list(zip(seen, self._passes()[1].features, strict=True))
+
+    def _passes(self):
+        """Measurement and results of the passes; ValueError for ions that are left to the cap."""
+        if self._followed is None:
+            raise ValueError(f"reconstruction must have a surface that was followed, got {self.verdict!r}")
+        return self._followed
 
     def again(
         self,
@@ -284,7 +290,7 @@ class EvolvingReconstruction(Reconstruction):
         -------
         ndarray, shape (n, 3)
         """
-        measured, fixed = self._followed
+        measured, fixed = self._passes()
         surface = EvolvingSurface(ions)
         by = by or fixed.way
         if by not in ("surface", "both"):
@@ -311,7 +317,7 @@ class EvolvingReconstruction(Reconstruction):
         By `VOLTAGE_ERROR`, and by the evaporation field of each phase, one standard error of it; without phases at the
         rim of the field of view by the voltage alone, which is one of two measures, or tells of it a second time.
         """
-        ions, measured = self.sequence, self._followed[0]
+        ions, measured = self.sequence, self._passes()[0]
         known = self.followed_by == "volume" or any(one.error == one.error for one in self.phases)
         if measured.voltages is None or not known:
             return []

@@ -67,10 +67,7 @@ def position_covariances(
     depth, too.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
-    if reconstruction.history is None:
-        raise ValueError(f"reconstruction must have a surface that was followed, got {reconstruction.verdict!r}")
-    errors = constant_errors_of(constant_errors)
-    ions = reconstruction.sequence
+    errors, ions = constant_errors_of(constant_errors), reconstruction.sequence
     usual = reconstruction.again(ions)
     sphere = ions.radius * ions.directions - np.array([0, 0, 1]) * ions.depths[1:, None]
     if local is None:

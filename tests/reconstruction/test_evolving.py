@@ -109,7 +109,11 @@ def test_a_phase_at_the_rim_without_a_voltage_is_left_to_the_cap(voltage, why):
 
 def test_few_ions_wide_views_and_rolled_ions_are_left_to_the_cap():
     hits, labels = ions_of(50, voltage=varying(50))
-    assert evolving(hits, labels=labels).verdict == "cap: 50 ions, fewer than 2,000"
+    found = evolving(hits, labels=labels)
+    assert found.verdict == "cap: 50 ions, fewer than 2,000" and found.followed_by == "cap"
+    for of_passes in (lambda: found.sequence, lambda: found.found_features, found.recession_changes):
+        with pytest.raises(ValueError, match="a surface that was followed, got 'cap: 50 ions"):
+            of_passes()
     hits, _ = ions_of(half=1.1)
     assert evolving(hits).verdict == "cap: a half angle of 63 degrees on the cap, above 60"
     hits, _ = ions_of()
