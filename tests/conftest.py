@@ -104,6 +104,7 @@ def kept_folder(config, tmp_path_factory, name, packages):
         return tmp_path_factory.mktemp(name)
     package = Path(ae.__file__).parent
     paths = [path for part in packages for path in sorted((package / part).rglob("*")) if path.is_file()]
+    paths += sorted(package.glob("*.py"))  # such as the units
     sources = [code_of(path) for path in paths if path.suffix in (".py", ".so", ".pyd", ".npz")]
     folder = config.cache.mkdir(name) / hash_of(*sources)
     folder.mkdir(exist_ok=True)
@@ -121,11 +122,14 @@ def kept_runs(pytestconfig, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def computed_once(pytestconfig, tmp_path_factory):
-    """`compute()`, by the first test that needs what a package of the library computes from these arguments."""
+    """`compute()`, by the first test that needs what these packages compute from these arguments."""
+    folders = {}
 
-    def computed(name, package, arguments, compute):
+    def computed(name, packages, arguments, compute):
+        if name not in folders:
+            folders[name] = kept_folder(pytestconfig, tmp_path_factory, name, packages)
         key = hash_of(pickle.dumps(arguments))
-        path = kept_folder(pytestconfig, tmp_path_factory, name, (*PACKAGES_OF_RUNS, package)) / f"{key}.pickle"
+        path = folders[name] / f"{key}.pickle"
         lock = FileLock(path.with_suffix(".lock"), key, wait=lambda: None)
         try:
             if not path.exists():
@@ -142,10 +146,11 @@ def computed_once(pytestconfig, tmp_path_factory):
 @pytest.fixture(scope="session")
 def indexed_once(computed_once):
     """`ae.index`, computed by the first test that needs it."""
+    packages = ("_common", "_core", "specimen", "detection", "maps")
 
     def indexed(measured, material, **options):
         arguments = (measured, material, sorted(options.items()))
-        return computed_once("indexings", "maps", arguments, lambda: ae.index(measured, material, **options))
+        return computed_once("indexings", packages, arguments, lambda: ae.index(measured, material, **options))
 
     return indexed
 

@@ -348,7 +348,8 @@ class ForJson:
         -------
         dict
         """
-        return for_json({name: getattr(self, name) for name in self._in_json or vars(self)})
+        names = self._in_json or [item.name for item in fields(self)]  # type: ignore[arg-type]
+        return for_json({name: getattr(self, name) for name in names})
 
 
 def from_plain(plain: Any, *kinds: type, what: str = "settings") -> Any:

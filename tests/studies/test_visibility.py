@@ -18,6 +18,8 @@ NICKEL = ae.material("Ni")
 FIELD = NICKEL.evaporation_field
 EVERYTHING = ae.Instrument(field_of_view=160.0)
 RADIUS, COVER = 2.8, 0.3  # nm
+PACKAGES = ("_common", "_core", "specimen", "detection", "emission", "evaporation", "simulation")
+PACKAGES += ("measures", "reconstruction", "studies")  # all that operators are computed by
 
 
 def particle(size, fraction=0.5, ratio=1.0, radius=RADIUS):
@@ -39,7 +41,7 @@ def operators(tip, computed_once):
     def compute():
         return ae.studies.origin_operators(arguments[0], tip, EVERYTHING, axes=arguments[-1], n_threads=1)
 
-    return computed_once("operators", "studies", arguments, compute)
+    return computed_once("operators", PACKAGES, arguments, compute)
 
 
 @pytest.fixture(scope="session")

@@ -103,7 +103,6 @@ _BEYOND = 1.1  # refined scales may leave bounds that nobody gave by this factor
 _OTHER_SCALES = 1.12  # factor of the scales at which other crystals are searched for their densities
 _MAP_BINS = 128
 _LENS_STEPS = 20  # of the refinement of a candidate at most
-_OTHER_RADIUS = 1.21  # largest factor of its scale with patterns of one radius
 _SHOWN_SIGMA = 0.7  # smoothing of a pattern that is drawn [degrees]
 
 
@@ -560,7 +559,7 @@ class _Crystal:
             )  # fmt: skip
 
         best = refined(self.densities, fit, fit.amplitudes, self.bounds)
-        bounds = best.scale_at_centre / _OTHER_RADIUS, best.scale_at_centre * _OTHER_RADIUS
+        bounds = best.scale_at_centre / _BEYOND**2, best.scale_at_centre * _BEYOND**2
         radii = np.split(self.densities, len(self.patterns))
         scales = [refined(densities, best, None, bounds).scale_at_centre for densities in radii]
         spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else 0.0
