@@ -10,6 +10,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+import apt_evap as ae
+from apt_evap.cli._spectrum_of_file import _alone
 from apt_evap.cli.main import main
 from apt_evap.cli.parser import make_parser
 from apt_evap.detection import ion_blocks
@@ -268,6 +270,17 @@ def test_memory_does_not_grow_with_the_file(tmp_path, monkeypatch, blocks_of):
     for command in ("info", "export", "map"):
         # 304,000 ions more, which would be 13 MB
         assert peaks[command, 50] - peaks[command, 12] < 1.5e6, command
+
+
+@pytest.mark.parametrize("name", ["plain", "strays"])
+def test_which_ions_are_alone_in_their_pulse_is_known_in_blocks(tmp_path, blocks_of, name):
+    blocks_of(700)
+    (tmp_path / "a.epos").write_bytes(FILES[name])
+    blocks = formats.ion_blocks(tmp_path / "a.epos", ("mass_to_charge",), further=("x", "y", "pulse_id"))
+    gathered = blocks.gathered("mass_to_charge", alone=("pulse_id", _alone)).extra["alone"]
+    _, pulse, ions = np.unique(ae.read(tmp_path / "a.epos").pulse_id, return_inverse=True, return_counts=True)
+    np.testing.assert_array_equal(gathered, ions[pulse] == 1)
+    assert 0.5 < gathered.mean() < 0.95
 
 
 @pytest.mark.slow
