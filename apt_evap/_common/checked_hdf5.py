@@ -168,6 +168,7 @@ class CheckedFile:
 
     def __init__(self, file: h5py.File, name: str, size: int) -> None:
         self._file, self.name, self._size = file, name, size
+        self._listed: dict[str, set[str]] = {}  # names in the groups that were asked for
 
     @property
     def label(self) -> Label | None:
@@ -254,7 +255,9 @@ class CheckedFile:
     def _names(self, item):
         """Names in a group; HDF5 takes a name that it cannot look up for one that is missing."""
         with _damage(self.name):
-            return set(item) if isinstance(item, h5py.Group) else set()
+            if item.name not in self._listed:
+                self._listed[item.name] = set(item) if isinstance(item, h5py.Group) else set()
+            return self._listed[item.name]
 
     def _item(self, path):
         item = self._file

@@ -157,7 +157,11 @@ class _Figure(Figure):
 
     def draw(self, renderer: Any) -> None:
         with default_settings():
-            super().draw(renderer)
+            layout = self.get_layout_engine()
+            if self.canvas.is_saving() and isinstance(layout, _Layout):
+                layout.execute(self)  # Matplotlib draws once for it, and once more for the file
+            else:
+                super().draw(renderer)
 
     def savefig(self, *args: Any, **kwargs: Any) -> None:
         with default_settings():

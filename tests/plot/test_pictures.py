@@ -1,5 +1,6 @@
 """What pictures show is what they were given, with its unit; how they look is looked at."""
 
+import io
 import os
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from matplotlib.text import Text
 import apt_evap as ae
 from apt_evap import plot
 from apt_evap.maps.profiles import Profile
-from apt_evap.plot._figure import set_log_ticks
+from apt_evap.plot._figure import _Layout, set_log_ticks
 from apt_evap.plot.map_figures import specimen_title
 from apt_evap.plot.profile_figures import rectangles
 from apt_evap.plot.responses import ion_colors
@@ -94,6 +95,28 @@ def test_a_layout_is_repeated_while_it_changes_ticks(monkeypatch, changes, passe
     monkeypatch.setattr(ConstrainedLayoutEngine, "execute", lay_out)
     figure.get_layout_engine().execute(figure)
     assert len(done) == passes
+
+
+@pytest.mark.parametrize("form", ["png", "svg", "pdf"])
+def test_a_file_is_drawn_once_after_its_layout(monkeypatch, form):
+    figure = plot.new_figure((5, 3))
+    ax = figure.subplots()
+    ax.set(xlabel="x [mm]", ylabel="hits per area / mean", title="a map")
+    drawn, draw = [], type(ax).draw
+    monkeypatch.setattr(type(ax), "draw", lambda self, renderer: drawn.append(self) or draw(self, renderer))
+    once = io.BytesIO()
+    figure.savefig(once, format=form)
+    assert drawn == [ax]
+    position = ax.get_position().bounds
+    # as by Matplotlib, which draws everything for the layout, too
+    figure = Figure((5, 3), dpi=150, layout=_Layout(compress=True, h_pad=0.08, w_pad=0.06))
+    ax = figure.subplots()
+    ax.set(xlabel="x [mm]", ylabel="hits per area / mean", title="a map")
+    twice = io.BytesIO()
+    figure.savefig(twice, format=form)
+    assert ax.get_position().bounds == position
+    if form == "png":
+        assert twice.getvalue() == once.getvalue()
 
 
 def test_titles_are_broken_at_commas():
