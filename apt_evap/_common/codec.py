@@ -58,7 +58,7 @@ class _Setting:
         kind = " ".join(filter(None, (self.kind, self.unit and f"[{self.unit}]", self.bounds)))
         return [
             f"{name} : {kind}{optional}",
-            *textwrap.indent(textwrap.fill(self.text, 110), "    ").split("\n"),
+            *(f"    {line}" for line in textwrap.wrap(self.text, 110)),
         ]
 
 

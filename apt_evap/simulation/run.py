@@ -6,7 +6,7 @@ The table is in `apt_evap.simulation.run_table`; the other modules, of one of th
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,15 @@ from apt_evap.detection.hits import Hits
 from apt_evap.detection.instrument import Instrument
 from apt_evap.detection.microscope.local_electrode import LocalElectrode
 from apt_evap.emission.perturbations import Perturbation, perturbation_text
-from apt_evap.measures.point_cloud import PointCloud
 from apt_evap.simulation.observation import Observation, behind, on_detector
 from apt_evap.simulation.parts_of_runs import join_parts, select_rows
 from apt_evap.simulation.real_units import OperatingPoint, RealUnits, real_units_of
 from apt_evap.simulation.run_hdf5 import read_run, write_run
 from apt_evap.simulation.run_table import RunTable
 from apt_evap.simulation.stop_reason import StopReason
+
+if TYPE_CHECKING:
+    from apt_evap.measures.point_cloud import PointCloud
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -183,7 +185,7 @@ class Run(RunTable):
         """
         return self.observation.hits(perturbation, by_response)
 
-    def sites(self) -> PointCloud:
+    def sites(self) -> "PointCloud":
         """True sites of the ions in the specimen, with z out of it, and their elements: for measures of the truth.
 
         Returns
@@ -198,6 +200,8 @@ class Run(RunTable):
         """
         names = tuple(dict.fromkeys(self.elements))  # phases may share an element
         number = np.array([names.index(element) for element in self.elements])
+        from apt_evap.measures.point_cloud import PointCloud  # a map must not wait for it
+
         return PointCloud(self.emissions.positions, number[self.species], names, source="sites of the run")
 
     def places(
