@@ -1,6 +1,7 @@
 """`apt-evap reconstruct`: positions of ions in the specimen from their hits."""
 
 import argparse
+import math
 from pathlib import Path
 
 from apt_evap.cli._declared_options import add_declared
@@ -121,11 +122,14 @@ def execute(options: argparse.Namespace) -> int:
         raise FileError(f"{str(output)!r} exists: --force overwrites it")
     picture = output.with_suffix(".png") if options.picture is None else picture_path(options.picture)
     check_output(picture, is_picture, options.force)
-    hits, known, crystal, rolled = _ions(options, output)
+    extent = _Extent()
+    hits, known, crystal, rolled = _ions(options, output, extent)
     settings = _settings(options, known)
     _check_complete(options, settings, hits)
-    if (extent := _extent(options, hits)) is not None:
-        size = " x ".join(f"{length:.1f}" for length in extent)
+    if hits.positions is not None and hits.outcome is None:
+        extent.add(hits.positions)
+    if extent.lengths is not None:
+        size = " x ".join(f"{length:.1f}" for length in extent.lengths)
         note(f"the positions in {options.file!r}, {size} nm, are not used: those that are written follow from its hits")
     ranges = read_ranges(options.ranges) if options.ranges is not None else None
     file = file_of(options)
@@ -213,33 +217,28 @@ def _main_element(hits):
     return name if name in MATERIALS else None
 
 
-def _extent(options, hits):
-    """Lengths of the positions that a measured file has [nm], None without any."""
-    import numpy as np
+class _Extent:
+    """Extent of the positions that a file has."""
 
-    from apt_evap.cli._files import blocks_of
+    def __init__(self) -> None:
+        self._low, self._high = [math.inf] * 3, [-math.inf] * 3
 
-    class Extent:
-        def __init__(self):
-            self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
+    def add(self, positions) -> None:
+        """Take the positions of some ions."""
+        import numpy as np
 
-        def add(self, ions):
-            columns = ions.positions.T
-            if not (finite := np.isfinite(columns)).all():
-                columns = columns[:, finite.all(axis=0)]
-            for axis, column in enumerate(columns):  # 0.4 ms of 65,000 ions; along the axis of the rows 10
-                self.low[axis] = min(self.low[axis], column.min(initial=np.inf))
-                self.high[axis] = max(self.high[axis], column.max(initial=-np.inf))
+        columns = positions.T
+        if not (finite := np.isfinite(columns)).all():
+            columns = columns[:, finite.all(axis=0)]
+        for axis, column in enumerate(columns):  # 0.4 ms of 65,000 ions; along the axis of the rows 10
+            self._low[axis] = min(self._low[axis], float(column.min(initial=math.inf)))
+            self._high[axis] = max(self._high[axis], float(column.max(initial=-math.inf)))
 
-    if hits.positions is not None:
-        extent = Extent()
-        extent.add(hits)
-    elif (blocks := blocks_of(options, ("positions",), without=("ranges", "distance"))) is not None:
-        extent = blocks.fed(Extent, "positions")
-    else:
-        return None
-    lengths = extent.high - extent.low
-    return lengths if hits.outcome is None and (lengths > 0).any() and np.isfinite(lengths).all() else None
+    @property
+    def lengths(self):
+        """Lengths of the extent [nm], None without any."""
+        lengths = [high - low for low, high in zip(self._low, self._high, strict=True)]
+        return lengths if max(lengths) > 0 and all(map(math.isfinite, lengths)) else None
 
 
 def _surface(options, hits, ranges):
@@ -334,7 +333,7 @@ def _tell_check(options, reconstruction, material, axis, assumed, rolled=False):
     return found | {"sizes": [size._asdict() for size in sizes], "errors_of_sizes": counted}
 
 
-def _ions(options, output):
+def _ions(options, output, extent):
     """Ions of the file, the constants that it determines, the orientation of a run, and whether its ions roll."""
     from apt_evap.cli._files import in_real_units, read
     from apt_evap.detection.hits import Hits
@@ -343,7 +342,7 @@ def _ions(options, output):
     from apt_evap.simulation.config.perturbation_text import read_perturbation
     from apt_evap.simulation.run import Run
 
-    if (content := _ions_of_large_file(options, output)) is None:
+    if (content := _ions_of_large_file(options, output, extent)) is None:
         content = read(options)
     if isinstance(content, Run):
         run = in_real_units(content, options)
@@ -361,18 +360,22 @@ def _ions(options, output):
     return content, {}, None, False
 
 
-def _ions_of_large_file(options, output):
-    """Ions of a large file, with the columns that a .pos needs; None for other files, or if more is needed."""
+def _ions_of_large_file(options, output, extent):
+    """Ions of a large file, with the columns that a .pos needs; None for other files, or if more is needed.
+
+    The extent takes their positions.
+    """
     from apt_evap.cli._files import blocks_of
 
     if output.suffix.lower() != ".pos" or options.shape != "cap" or options.labels:
         return None
     needed = ("mass_to_charge", "voltage", "pulse_voltage")
     # the distance is that of the reconstruction, and gives no masses
-    blocks = blocks_of(options, ("x", "y"), further=needed, without=("ranges", "distance"))
+    blocks = blocks_of(options, ("x", "y"), further=(*needed, "positions"), without=("ranges", "distance"))
     if blocks is None or not blocks.field.ions or (options.distance is not None and needed[0] not in blocks.columns):
         return None
-    return blocks.gathered("x", "y", *(name for name in needed if name in blocks.columns))
+    seen = {"positions": extent.add} if "positions" in blocks.columns else {}
+    return blocks.gathered("x", "y", *(name for name in needed if name in blocks.columns), seen=seen)
 
 
 def _settings(options, known):

@@ -177,16 +177,23 @@ class IonBlocks:
         self._warn_of_size(size, lambda: self.field.size)
         return consumer if self._strays is None else self.fed(make, *columns)
 
-    def gathered(self, *names: str, **made: tuple[str, Callable[[NDArray[Any]], NDArray[Any]]]) -> Hits:
+    def gathered(
+        self,
+        *names: str,
+        seen: Mapping[str, Callable[[NDArray[Any]], object]] | None = None,
+        **made: tuple[str, Callable[[NDArray[Any]], NDArray[Any]]],
+    ) -> Hits:
         """Columns of all ions, and their coordinates if some are not detected, because of which they are needed.
 
-        `made` are further columns, by name: the column that they are made of, and a function of it in a block.
+        `made` are further columns, by name: the column that they are made of, and a function of it in a block. `seen`
+        are functions of blocks of columns that are not kept; if there are strays, they are called twice.
         """
+        seen = seen or {}
 
         def gathering():  # again once strays are found
-            return _Gathered(len(self), names if self.whole else (*names, *_PLACES), made)
+            return _Gathered(len(self), names if self.whole else (*names, *_PLACES), made, seen)
 
-        gathered = self.fed(gathering, *names, *(column for column, _ in made.values()))
+        gathered = self.fed(gathering, *names, *seen, *(column for column, _ in made.values()))
         columns: dict[str, Any] = gathered.columns
         extra = {name: columns.pop(name) for name in made}
         hits = Hits(**columns, extra=extra, source=self.source)
@@ -227,8 +234,14 @@ class IonBlocks:
 class _Gathered:
     """Columns of all ions."""
 
-    def __init__(self, ions: int, names: tuple[str, ...], made: Mapping[str, tuple[str, Callable[..., Any]]]) -> None:
-        self._ions, self._names, self._made, self._at = ions, dict.fromkeys(names), made, 0
+    def __init__(
+        self,
+        ions: int,
+        names: tuple[str, ...],
+        made: Mapping[str, tuple[str, Callable[..., Any]]],
+        seen: Mapping[str, Callable[..., object]],
+    ) -> None:
+        self._ions, self._names, self._made, self._seen, self._at = ions, dict.fromkeys(names), made, seen, 0
         self.columns: dict[str, NDArray[Any]] = {}
 
     def add(self, hits: Hits) -> None:
@@ -239,4 +252,6 @@ class _Gathered:
             if name not in self.columns:
                 self.columns[name] = np.empty((self._ions, *values.shape[1:]), values.dtype)
             self.columns[name][self._at : self._at + len(hits)] = values
+        for column, function in self._seen.items():
+            function(getattr(hits, column))
         self._at += len(hits)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from apt_evap._common.digits import rounded_text
-from apt_evap._common.types import Integers
+from apt_evap._common.quantiles import quantile
+from apt_evap._common.types import Floats, Integers
 from apt_evap._common.validation import check_kind
 from apt_evap.detection.color_limits import color_limits
 from apt_evap.detection.hits import Hits
+from apt_evap.detection.ion_blocks import ROWS, Field, IonBlocks
 from apt_evap.plot._figure import add_colorbar, interval_of_fraction, new_figure, set_title, with_default_settings
-from apt_evap.plot.map_figures import binned
+from apt_evap.plot.map_figures import binned_blocks
 from apt_evap.reconstruction.cap_geometry import parts_of
 from apt_evap.reconstruction.consistency import density_near_axis
 from apt_evap.reconstruction.reconstructed import Reconstruction
@@ -99,7 +103,7 @@ def reconstruction(
     else:
         _density(profile, result)
         every = slice(None, None, -(-len(result) // _POINTS))  # many more than the pixels of the picture
-        last.plot(result.depths[every], result.radii[every], color="C0")
+        last.plot(result.depths_of(every), result.radii[every], color="C0")
         last.set(xlabel="depth of the apex [nm]", ylabel="radius of the cap [nm]", ylim=(0, None))
     lines = _description(result)
     if title is not None:
@@ -143,8 +147,9 @@ def species_of(result: Reconstruction, ranges: Ranges | None) -> tuple[list[str]
 
 def _side(ax: Axes, result, names, species, is_long):
     x, y, z = result.positions.T
-    middle, height = np.median(y), result.extents[1]
-    near = [rows.start + np.flatnonzero(np.abs(y[rows] - middle) < 0.05 * height) for rows in parts_of(len(y))]
+    height, parts = result.extents[1], list(parts_of(len(y)))
+    middle = quantile(lambda: (y[rows] for rows in parts), float(y.min()), float(y.max()), 0.5)
+    near = [rows.start + np.flatnonzero(np.abs(y[rows] - middle) < 0.05 * height) for rows in parts]
     near = np.concatenate(near)
     near = near[:: max(1, -(-len(near) // _DOTS))]
     size = float(np.clip(_DOTS / max(len(near), 1), 1.5, 12.0))
@@ -163,7 +168,8 @@ def _side(ax: Axes, result, names, species, is_long):
 
 
 def _top(ax: Axes, result):
-    shown = binned(Hits(x=result.positions[:, 0], y=result.positions[:, 1]))  # nm in place of mm
+    places = _Places(result.positions)
+    shown = binned_blocks(IonBlocks(places, places.field, "", lambda *sizes: None))
     low, high = color_limits(shown)
     image = ax.imshow(
         shown.density, origin="lower", extent=shown.extent, cmap="inferno", vmin=low, vmax=high, interpolation="nearest"
@@ -171,6 +177,24 @@ def _top(ax: Axes, result):
     ax.set(aspect="equal", xlabel="x [nm]", ylabel="y [nm]")
     set_title(ax, "along the axis")
     add_colorbar([image], ax, label="ions per area / mean")
+
+
+class _Places:
+    """Places along the axis as blocks of ions, nm in place of mm: together they are a second array of all."""
+
+    available: tuple[str, ...] = ("x", "y")
+    columns = available
+    largest = 0
+
+    def __init__(self, positions: Floats) -> None:
+        self.n, self._positions, self.field = len(positions), positions, Field(len(positions))
+        for block in self.blocks(self.columns, ROWS):
+            self.field.add(block.x, block.y)
+
+    def blocks(self, columns: tuple[str, ...], rows: int) -> Iterator[Hits]:
+        """Blocks of so many ions."""
+        for start in range(0, self.n, rows):
+            yield Hits(x=self._positions[start : start + rows, 0], y=self._positions[start : start + rows, 1])
 
 
 def _sections(values):
@@ -181,7 +205,8 @@ def _sections(values):
 
 def _density(ax: Axes, result):
     near, rim = result.core
-    depths = result.depths[near]  # from cap to cap, so that the curvature does not matter
+    # from cap to cap, so that the curvature does not matter
+    depths = np.concatenate([result.depths_of(rows)[near[rows]] for rows in parts_of(len(near))])
     edges = _sections(depths)
     ions = np.histogram(depths, len(edges) - 1, (edges[0], edges[-1]))[0]  # equal widths: without a search
     volume = np.pi * rim**2 * np.diff(edges)

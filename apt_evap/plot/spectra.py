@@ -207,7 +207,8 @@ def _masses(ions):
         ions.require_real_units("a spectrum")
         ions = ions.hits(ions.first_perturbation)
     (mass,) = check_kind(ions, "ions", Hits, "a Run or Hits").require("mass_to_charge")
-    mass = mass[ions.detected & np.isfinite(mass)]
+    if not (inside := ions.detected & np.isfinite(mass)).all():
+        mass = mass[inside]
     if not len(mass):
         raise ValueError(f"a spectrum needs detected ions, got none of {ions!r}")
     return mass
@@ -254,9 +255,11 @@ def _default_limits(masses):
         background = np.median(np.pad(counts, (0, int(empty)))) if empty < len(intervals) else 0.0
         threshold = max(_OCCUPIED * len(mass), background + _SIGNIFICANT * np.sqrt(background))
         occupied = intervals[counts >= threshold]
-        chosen = mass[(mass >= occupied[0]) & (mass < occupied[-1] + 1)] if len(occupied) else mass
-        lows.append(chosen.min())
-        highs.append(chosen.max())
+        first, end = (occupied[0], occupied[-1] + 1) if len(occupied) else (-np.inf, np.inf)
+        for part in _chunks(mass):
+            if len(chosen := part[(part >= first) & (part < end)]):
+                lows.append(chosen.min())
+                highs.append(chosen.max())
     low, high = float(min(lows)), float(max(highs))
     margin = max(_MARGIN * (high - low), 0.5)
     return max(low - margin, 0.0), high + margin

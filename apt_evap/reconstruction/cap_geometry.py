@@ -104,6 +104,21 @@ class CapGeometry:
         sine_over_rho = np.divide(np.sin(angles), rho, out=np.zeros_like(rho), where=rho > 0)
         return (sine_over_rho * x, sine_over_rho * y), angles
 
+    def _projected(self, hits, rows):
+        """Place of some ions, x / R and y / R, and depth below the apex over R, projected from behind the centre.
+
+        With theta - theta' as the angle at the centre, all sines follow from those of theta' without an arc.
+        """
+        x, y = (column[rows].astype(np.float64) for column in hits.require("x", "y"))
+        squares = x * x + y * y
+        cosine = 1 / np.sqrt(1 + squares / self.distance**2)  # of theta'
+        shift = (self.compression - 1) / self.distance * cosine  # sin(theta - theta') / rho
+        straight = np.sqrt(np.maximum(1 - squares * shift * shift, 0.0))  # cos(theta - theta')
+        sine = cosine * (straight / self.distance + shift)  # sin(theta) / rho
+        # 1 - cos(theta) without a difference of near numbers
+        below = squares * sine * sine / (1 + cosine * (straight - squares * shift / self.distance))
+        return (sine * x, sine * y), below
+
     def positions(self, hits: Hits, radii: Floats, shifts: Floats | None = None) -> Floats:
         """Positions of ions on caps of known radii.
 
@@ -124,12 +139,15 @@ class CapGeometry:
         voltages = self.lens_voltages(hits)
         swept, widening = self.cross_sections(radii, voltages)
         positions = np.empty((len(radii), 3))
-        positions[:, 2] = _apex_depths(radii, self.volume, swept, widening)
+        _put_apex_depths(positions[:, 2], radii, self.volume, swept, widening)
         # all at once with a lens
         for rows in parts_of(len(radii)) if self.lens is None else [slice(None)]:
-            places, angles = self._places(hits, rows, radii[rows], voltages)
             # depth below the apex in units of R, 1 - cos(theta)
-            below = 2 * np.sin(angles / 2) ** 2
+            if self.projection == "bas":
+                places, below = self._projected(hits, rows)
+            else:
+                places, angles = self._places(hits, rows, radii[rows], voltages)
+                below = 2 * np.sin(angles / 2) ** 2
             if shifts is not None:
                 places = places + shifts[rows].T
                 squares = np.minimum((places**2).sum(axis=0), 1.0)
@@ -153,13 +171,14 @@ def voltages_of(hits: Hits) -> Floats:
     """Standing voltage plus pulse of each ion [V], shape (n,)."""
     (voltages,) = hits.require("voltage")
     voltages = voltages.astype(np.float64)
-    if hits.pulse_voltage is not None:
-        voltages += hits.pulse_voltage
-    wrong = np.flatnonzero(~(np.isfinite(voltages) & (voltages > 0)))
-    if len(wrong):
-        raise ValueError(
-            f"the voltage of every ion must be finite and > 0, got {voltages[wrong[0]]:g} V for ion {wrong[0]}"
-        )
+    for rows in parts_of(len(voltages)):
+        part = voltages[rows]
+        if hits.pulse_voltage is not None:
+            part += hits.pulse_voltage[rows]
+        wrong = np.flatnonzero(~(np.isfinite(part) & (part > 0)))
+        if len(wrong):
+            ion = rows.start + wrong[0]
+            raise ValueError(f"the voltage of every ion must be finite and > 0, got {part[wrong[0]]:g} V for ion {ion}")
     return voltages
 
 
@@ -194,11 +213,11 @@ def _cap_angles(ratios, projection, compression):
     return straight + np.arcsin(np.clip(sine, -1.0, 1.0)) + np.where(np.abs(sine) > 1, _RIGHT_ANGLE, 0.0)
 
 
-def _apex_depths(radii, volume, swept, widening):
-    """Depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
+def _put_apex_depths(depths, radii, volume, swept, widening):
+    """Set the depth of the apex at each ion [nm]: volume = <R^2> (swept dz - widening dR) between two ions."""
     # areas half way between two ions
     swept, widening = (area if np.ndim(area) == 0 else (area[:-1] + area[1:]) / 2 for area in (swept, widening))
-    depths = np.zeros(len(radii))
+    depths[:1] = 0
     for rows in parts_of(len(radii) - 1):
         before, after = radii[:-1][rows], radii[1:][rows]
         areas, losses = (area if np.ndim(area) == 0 else area[rows] for area in (swept, widening))
@@ -206,4 +225,3 @@ def _apex_depths(radii, volume, swept, widening):
         steps = (volume / squares + losses * (after - before)) / areas
         steps[0] += depths[rows.start]
         np.cumsum(steps, out=depths[1:][rows])
-    return depths

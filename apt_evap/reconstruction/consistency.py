@@ -128,8 +128,8 @@ def density_near_axis(reconstruction: Reconstruction) -> Check:
     expected = settings.efficiency / settings.atomic_volume
     near, rim = reconstruction.core
     # from cap to cap: the depth of the apex, so that the curvature does not matter
-    depths = reconstruction.depths
-    volume = math.pi * rim**2 * float(depths[-1] - depths[0])
+    first, last = reconstruction.depths_of([0, -1])
+    volume = math.pi * rim**2 * float(last - first)
     value = np.count_nonzero(near) / volume if volume > 0 else math.nan
     small = "more than expected: the compression is too small, or ions are focused on the axis"
     large = "fewer than expected: the compression is too large, or ions are deflected from the axis"

@@ -229,10 +229,9 @@ class EvolvingReconstruction(Reconstruction):
 
     _has_free_projection: ClassVar[bool] = False
 
-    @property
-    def depths(self) -> Floats:
-        """Depth of the apex of the sphere at the evaporation of each ion [nm], shape (n,)."""
-        return super().depths if self.apex_depths is None else self.apex_depths
+    def depths_of(self, ions: Any) -> Floats:
+        """Depth of the apex of the sphere at the evaporation of some ions [nm]."""
+        return super().depths_of(ions) if self.apex_depths is None else self.apex_depths[ions]
 
     @property
     def cap_positions(self) -> Floats:

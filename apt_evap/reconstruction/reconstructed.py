@@ -16,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from apt_evap._common.quantiles import quantile
 from apt_evap._common.types import Booleans, Floats, Integers
 from apt_evap._common.validation import check_array, check_choice
 from apt_evap.detection.hits import Hits, MassRanges
@@ -106,16 +107,25 @@ class Reconstruction:
     @cached_property
     def depths(self) -> Floats:
         """Depth of the apex at the evaporation of each ion [nm], shape (n,)."""
-        return self.positions[:, 2] - depths_below_apex(self.positions, self.radii)
+        return self.depths_of(slice(None))
+
+    def depths_of(self, ions: Any) -> Floats:
+        """The `depths` of some ions, a slice or their numbers: of many, all are a large array."""
+        positions = self.positions[ions]
+        return positions[:, 2] - depths_below_apex(positions, self.radii[ions])
 
     @cached_property
     def core(self) -> tuple[Booleans, float]:
         """Ions within half the field of view, where densities and profiles are counted, (n,), and its radius [nm]."""
-        across = np.empty(len(self))
-        for rows in parts_of(len(self)):
-            across[rows] = np.hypot(*self.positions[rows, :2].T)
-        rim = _CORE * float(np.quantile(across, 0.99))
-        return across < rim, rim
+
+        def across(rows):
+            x, y = self.positions[rows, :2].T
+            return np.sqrt(x * x + y * y)
+
+        parts = list(parts_of(len(self)))
+        farthest = max(float(across(rows).max()) for rows in parts)
+        rim = _CORE * quantile(lambda: map(across, parts), 0.0, farthest, 0.99)
+        return np.concatenate([across(rows) < rim for rows in parts]), rim
 
     @property
     def angles(self) -> Floats:
@@ -281,7 +291,7 @@ class Reconstruction:
         -------
         CapDensity
         """
-        depths = self.depths
+        depths = self.depths_of([0, -1])
         swept = float(depths[-1] - depths[0])
         widening = float(self.radii[-1] - self.radii[0]) / swept if swept > 0 else 0.0
         rim = float(np.mean(self.geometry.rim_angles(self.hits, self.radii)))
@@ -305,7 +315,7 @@ def cap_reconstruction(
     hits: Hits, settings: ReconstructionSettings, origins: OriginTable | None = None
 ) -> tuple[Reconstruction, Integers]:
     """Reconstruction by a cap that stays a sphere, for resolved settings, and the rows of its ions."""
-    selection, rows, rim = _field_of_view(hits, settings)
+    selection, rows, rim, farthest = _field_of_view(hits, settings)
     geometry = CapGeometry.of(settings, rim)
     if settings.mode == "given":
         radii = _radii_of_user(settings.radius, len(hits))[rows]
@@ -313,7 +323,7 @@ def cap_reconstruction(
         radii = _radii_by_voltage(selection, settings)
     else:
         radii = np.empty(0)  # the angle at the rim does not depend on them
-    _check_angles(selection, radii, geometry)
+    _check_angles(selection, radii, geometry, farthest)
     if settings.mode == "shank":
         radii = _radii_on_shank(len(selection), settings, geometry)
 
@@ -327,16 +337,15 @@ def cap_reconstruction(
 
 
 def _field_of_view(hits, settings):
-    """Ions within the field of view, which of the hits these are, and its radius [mm]."""
+    """Ions within the field of view, which of the hits these are, its radius, and the largest distance in it [mm]."""
     x, y = hits.require("x", "y")
     rows, radius, farthest = hits.detected, settings.detector_radius, 0.0
     for part in parts_of(len(hits)):
-        rho = np.hypot(x[part], y[part], dtype=np.float64)
-        if radius is None:
-            farthest = max(farthest, float(rho.max(where=rows[part], initial=0.0)))
-        else:
-            with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):
+            rho = np.sqrt(np.square(x[part], dtype=np.float64) + np.square(y[part], dtype=np.float64))
+            if radius is not None:
                 rows[part] &= rho <= radius
+        farthest = max(farthest, float(rho.max(where=rows[part], initial=0.0)))
     if not rows.any():
         where = "" if radius is None else f" within the detector_radius, got {radius:g} mm"
         raise ValueError(f"nothing to reconstruct: none of the {len(hits):,} ions hit the detector{where}")
@@ -346,7 +355,7 @@ def _field_of_view(hits, settings):
         rim = farthest if radius is None else radius
     if rim == 0:
         raise ValueError("all ions hit the centre of the detector: detector_radius or area is needed, got neither")
-    return hits if rows.all() else hits[rows], rows, rim
+    return hits if rows.all() else hits[rows], rows, rim, farthest
 
 
 def _radii_of_user(radius, n):
@@ -359,7 +368,8 @@ def _radii_by_voltage(hits, settings):
     mean = trailing_mean(voltages_of(hits), settings.smoothing)
     if settings.lens is not None:
         return settings.lens.radius(mean, settings.evaporation_field)
-    return mean / (settings.field_factor * settings.evaporation_field)
+    mean /= settings.field_factor * settings.evaporation_field
+    return mean
 
 
 def _radii_on_shank(n, settings, geometry):
@@ -377,10 +387,9 @@ def _radii_on_shank(n, settings, geometry):
     return np.cbrt(settings.initial_radius**3 + 3 * slope * geometry.volume / net * np.arange(n))
 
 
-def _check_angles(hits, radii, geometry):
+def _check_angles(hits, radii, geometry, farthest):
     """Raise an error if an ion or the rim of the field of view is too far from the axis of the cap."""
-    farthest = [np.hypot(hits.x[part], hits.y[part]).max() for part in parts_of(len(hits))]
-    rim = max(geometry.field_of_view, float(np.max(farthest)))
+    rim = max(geometry.field_of_view, farthest)
     widest = float(np.max(geometry.angles(rim, radii, geometry.lens_voltages(hits))))
     limit = geometry.largest_angle
     if not widest < limit:  # also NaN

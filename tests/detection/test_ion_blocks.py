@@ -343,12 +343,14 @@ def test_blocks_give_the_reconstruction_of_the_whole_file(tmp_path, monkeypatch,
     whole = None
     for rows in (None, 977, 5_000):
         blocks_of(rows)
-        given = [answers(capsys, "reconstruct", "a.epos", *constants, "-o", "r.pos", "--force")[:2]]
+        code, told, notes = answers(capsys, "reconstruct", "a.epos", *constants, "-o", "r.pos", "--force")
+        given = [(code, told), [line for line in notes.splitlines() if "are not used" in line]]
         given += [(tmp_path / file).read_bytes() for file in ("r.pos", "r.png")]
         (tmp_path / "r.png").unlink()  # otherwise it is replaced
         whole = whole or given
         assert given == whole, rows
     assert whole[0][0] == 0
+    assert " nm, are not used" in whole[1][0]
 
 
 def test_positions_in_parts_are_those_of_all_ions(monkeypatch):

@@ -4,6 +4,7 @@ import io
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from matplotlib.text import Text
 
 import apt_evap as ae
 from apt_evap import plot
+from apt_evap.detection import ion_blocks
 from apt_evap.maps.profiles import Profile
 from apt_evap.plot._figure import _Layout, set_log_ticks
-from apt_evap.plot.map_figures import specimen_title
+from apt_evap.plot.map_figures import binned, specimen_title
 from apt_evap.plot.profile_figures import rectangles
 from apt_evap.plot.responses import ion_colors
 from apt_evap.plot.specimen_figures import mark_atoms
@@ -783,3 +785,16 @@ def test_a_long_reconstruction_lies_along_its_depth(rng):
         f"near the axis {check.found:.3g} ions per nm³, {check.found / check.expected:.2f} × efficiency / atomic volume"
     )
     assert side.figure.get_suptitle().count("\n") == 1 + (not check.good)
+
+
+def test_places_along_the_axis_are_counted_in_blocks_as_at_once(monkeypatch):
+    monkeypatch.setattr(ion_blocks, "ROWS", 700)
+    random = np.random.default_rng(4)
+    positions = random.uniform((-30, -20, 0), (30, 20, 50), (5000, 3))
+    result = ae.reconstruct(
+        ae.Hits(x=np.arange(5000.0), y=np.ones(5000)), radius=50.0, atomic_volume=0.01, distance=1e4
+    )
+    drawn = plot.reconstruction(replace(result, positions=positions))[1].images[0]
+    expected = binned(ae.Hits(x=positions[:, 0], y=positions[:, 1]))
+    np.testing.assert_array_equal(drawn.get_array().filled(np.nan), expected.density)
+    assert drawn.get_extent() == list(expected.extent)

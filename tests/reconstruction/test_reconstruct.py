@@ -11,6 +11,7 @@ import pytest
 
 import apt_evap as ae
 from apt_evap._common.codec import from_plain, to_plain
+from apt_evap.reconstruction import cap_geometry
 from apt_evap.reconstruction.density import density_of
 
 DISTANCE = 90.0  # mm
@@ -357,3 +358,36 @@ def test_settings_with_radii_of_the_ions_are_compared_and_kept(cone):
     with pytest.raises(ValueError, match="radius must have shape"):
         ae.reconstruct(cone[:999], first)
     assert from_plain(json.loads(json.dumps(to_plain(first))), type(first)) == first
+
+
+def test_a_wrong_voltage_is_named_in_any_part(monkeypatch):
+    monkeypatch.setattr(cap_geometry, "_PART", 4)
+    hits = ae.Hits(x=np.arange(10.0), y=np.ones(10), voltage=np.where(np.arange(10) == 6, -2e3, 1e3))
+    with pytest.raises(ValueError, match="got -1500 V for ion 6"):
+        ae.reconstruct(replace(hits, pulse_voltage=np.full(10, 500.0)), element="Al", distance=DISTANCE)
+
+
+def test_the_field_of_view_is_that_of_the_ions_that_hit():
+    """Ions beyond an area that is given count for the largest angle."""
+    x, outcome = np.array([3.0, 80.0, -20.0]), np.array([0, 1, 0])
+    hits = ae.Hits(x=x, y=np.zeros(3), outcome=outcome)
+    constants = {"atomic_volume": VOLUME, "distance": DISTANCE, "radius": 30.0}
+    assert ae.reconstruct(hits, **constants).geometry.field_of_view == 20.0
+    with pytest.raises(ValueError, match="all angles on the cap must be < 90 degrees"):
+        ae.reconstruct(ae.Hits(x=10 * x, y=x), area=300.0, **constants)
+
+
+@pytest.mark.parametrize("compression", [0.7, 1.0, 1.5, 2.0, 2.6])
+def test_places_without_arcs_are_those_of_the_angles(rng, compression):
+    """Up to a rim of 89 degrees, or a flight length of a third of the radius of the detector."""
+    x, y = rng.normal(size=(2, 3000))
+    radius = DISTANCE * np.linspace(0, 3, 3000) / np.hypot(x, y)
+    hits = ae.Hits(x=radius * x, y=radius * y)
+    result = ae.reconstruct(hits[:100], radius=30.0, **KNOWN | {"compression": compression, "detector_radius": 20.0})
+    _, angles = result.geometry.places(hits, np.empty(0))
+    hits = hits[angles < math.radians(89)]
+    places, angles = result.geometry.places(hits, np.empty(0))
+    (found_x, found_y), below = result.geometry._projected(hits, slice(None))
+    np.testing.assert_allclose(np.column_stack([found_x, found_y]), places, rtol=0, atol=2e-15)  # some roundings
+    np.testing.assert_allclose(below, 2 * np.sin(angles / 2) ** 2, rtol=1e-13, atol=1e-15)
+    assert np.degrees(angles.max()) > 50
