@@ -7,7 +7,7 @@ import pytest
 import scipy
 
 import apt_evap as ae
-from apt_evap.maps.crystallography.directions import zones
+from apt_evap.maps.crystallography.directions import poles, zones
 from apt_evap.maps.indexing import contrast_search as module
 from apt_evap.maps.indexing.contrast_search import (
     PIECES,
@@ -100,6 +100,25 @@ def test_local_contrast_has_no_unit_and_no_slow_change():
     assert np.abs(local_contrast(np.full((80, 80), 3.0), mask, 1.0, 4.0))[mask].max() < 1e-6
     several = local_contrast(np.stack([image, texture]), mask, 1.0, 4.0)
     assert several[1] == pytest.approx(both[0], abs=1e-9)
+    part, used = (slice(30, 52), slice(3, 20)), np.zeros((80, 80), bool)
+    used[32:50, 10:18] = True
+    whole = local_contrast(texture, mask, 1.0, 4.0, used)
+    assert local_contrast(texture, mask, 1.0, 4.0, used, part) == pytest.approx(whole[part], abs=1e-9)
+
+
+@pytest.mark.parametrize("element", ["W", "Ti"])
+def test_lines_and_poles_are_there_in_all_four_quarters_of_the_disc(element):
+    material = ae.material(element)
+    terms, axes, crystal = terms_of(material), zones(material), poles(material, 1)
+    directions = np.random.default_rng(5).normal(size=(400, 3)) * (1, 1, 0) + (0, 0, 1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    row, column = nearest_pixels(directions)
+    first = 2 * len(master_patterns(material.structure))
+    line, pole = terms._images[first, row, column], terms._images[first + axes.families.max() + 1, row, column]
+    sines = np.abs(directions @ axes.directions[axes.families == 0].T).min(axis=1)
+    angles = np.degrees(np.arccos(np.abs(directions @ crystal.normals.T).max(axis=1)))
+    assert (line[sines < 0.01] > 1.85).all() and (line[sines > 0.11] < 1.05).all()
+    assert (pole[angles < 0.7] < 0.5).all() and (pole[angles > 12] > 0.9).all()
 
 
 def direct_evidence(disc, patterns, matrix, scale):

@@ -55,34 +55,53 @@ _FILTER_STEP = 0.14  # of the logarithm of the half angle, for which the terms a
 
 
 def local_contrast(
-    values: np.ndarray, mask: np.ndarray, narrow: Floats, wide: Floats, used: np.ndarray | None = None
+    values: np.ndarray,
+    mask: np.ndarray,
+    narrow: Floats,
+    wide: Floats,
+    used: np.ndarray | None = None,
+    inner: tuple[slice, ...] | None = None,
 ) -> np.ndarray:
     """Contrast of images (..., ny, nx) of values from 0 in units of their local standard deviation.
 
     The ratio of the means in a narrow and a wide Gaussian (standard deviations along both axes [pixels]), minus one,
     between -1 and 1, is divided by the square root of its mean square in the wide one, which is at least half its
-    median over the pixels `used`, by default those of the mask.
+    median over the pixels `used`, by default those of the mask. Only rows and columns `inner` are computed.
     """
-    fine, slow = (_mean(values, mask, sigma) for sigma in (narrow, wide))
+    inner = tuple(slice(0, size) for size in mask.shape) if inner is None else inner
+    # what the mean square needs
+    outer = tuple(
+        slice(max(0, part.start - reach), part.stop + reach)
+        for part, reach in zip(inner, np.broadcast_to(_reach(wide), 2).tolist(), strict=True)
+    )
+    within = tuple(slice(part.start - r.start, part.stop - r.start) for part, r in zip(inner, outer, strict=True))
+    fine, slow = (_mean(values, mask, sigma, outer) for sigma in (narrow, wide))
     least = 1e-6 * np.maximum(slow.max(axis=(-2, -1), keepdims=True), 1e-30)
     contrast = np.clip(fine / np.maximum(slow, least) - 1, -1, 1)
-    deviation = np.sqrt(np.maximum(_mean(contrast**2, mask, wide), 0))
-    floor = _FLOOR * np.median(deviation[..., mask if used is None else used], axis=-1)[..., None, None]
-    return contrast / np.maximum(deviation, np.maximum(floor, _FLAT))
+    deviation = np.sqrt(np.maximum(_mean(contrast**2, mask[outer], wide, within), 0))
+    floor = _FLOOR * np.median(deviation[..., (mask if used is None else used)[inner]], axis=-1)[..., None, None]
+    return contrast[..., *within] / np.maximum(deviation, np.maximum(floor, _FLAT))
 
 
-def _mean(values, mask, sigma):
-    """Mean of the pixels that count in a Gaussian of these standard deviations."""
+def _mean(values, mask, sigma, part=(slice(None), slice(None))):
+    """Mean of the pixels that count in a Gaussian of these standard deviations, in rows and columns of a part."""
     along = [float(width) for width in np.broadcast_to(sigma, 2)]
     values = np.where(mask, values, values.dtype.type(0)).astype(np.result_type(values, np.float32), copy=False)
-    rows, columns = (_gaussian(size, width, values.dtype) for size, width in zip(mask.shape, along, strict=True))
-    return (rows @ values @ columns) / np.maximum(rows @ mask.astype(values.dtype) @ columns, 1e-6)
+    rows, columns = (
+        _gaussian(size, width, values.dtype)[near] for size, width, near in zip(mask.shape, along, part, strict=True)
+    )
+    return (rows @ values @ columns.T) / np.maximum(rows @ mask.astype(values.dtype) @ columns.T, 1e-6)
+
+
+def _reach(sigma):
+    """Pixels to which a Gaussian of a standard deviation reaches."""
+    return np.asarray(3 * sigma + 0.5).astype(int)
 
 
 @lru_cache(maxsize=64)
 def _gaussian(size, sigma, dtype):
     """Weights of a Gaussian filter of three standard deviations [pixels] along an axis, shape (size, size)."""
-    reach = int(3 * sigma + 0.5)
+    reach = int(_reach(sigma))
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     weights /= weights.sum()
     apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
@@ -123,12 +142,13 @@ class Terms:
     """
 
     def __init__(self, material: Material, patterns: Sequence[MasterPattern]) -> None:
-        line = (np.arange(2 * HALF + 1) - HALF) * PIXEL
+        # a quarter of the disc: the others are its mirror images
+        line = np.arange(HALF + 1) * PIXEL
         x, y = np.meshgrid(line, line)
         stretch = np.sqrt(np.maximum(1 - (x * x + y * y) / 4, 0))
         directions = np.stack([x * stretch, y * stretch, 1 - (x * x + y * y) / 2], axis=-1)
-        self._inside = self._used = x * x + y * y <= 2
-        images = [density for pattern in patterns for density in pattern.densities]
+        inside = x * x + y * y <= 2
+        images = []
         axes = zones(material)
         families = [axes.directions[axes.families == family] for family in range(axes.families.max() + 1)]
         for members in families:
@@ -140,7 +160,10 @@ class Terms:
             angles = np.arccos(np.minimum(np.abs(directions @ crystal.normals[spacings == spacing].T).max(axis=-1), 1))
             width = 0.5 * np.sqrt(2 * spacing / (_POLE_RADIUS * material.a))
             images.append(1 - np.exp(-0.5 * (angles / width) ** 2))
-        self._images = np.stack(images).astype(np.float32)
+        others = [(0, 0), (HALF, 0), (HALF, 0)]
+        drawn = np.pad(np.stack(images).astype(np.float32), others, mode="reflect")
+        self._images = np.concatenate([*(pattern.densities for pattern in patterns), drawn], dtype=np.float32)
+        self._inside = np.pad(inside, others[1:], mode="reflect")
         counts = 2 * len(patterns), len(families), len(set(spacings))
         self.priors = np.repeat([PATTERN, LINES, POLES], counts)
         """Standard deviations of the amplitudes, shape (k,)."""
@@ -150,9 +173,10 @@ class Terms:
         """Crystal structure."""
         # those of one triangle, see `equal`
         if self.structure == "hcp":
-            self._used = self._inside & (y >= 0) & (y <= x * _TANGENT)
+            used = inside & (y <= x * _TANGENT)
         else:
-            self._used = (directions[..., 0] >= 0) & (np.diff(directions, axis=-1) >= 0).all(axis=-1)
+            used = (np.diff(directions, axis=-1) >= 0).all(axis=-1)
+        self._used = np.pad(used, others[1:])
         # what is used, with the pixels beside it
         self._rows, self._columns = (
             slice(max(0, int(lines[0]) - 1), int(lines[-1]) + 2)
@@ -198,14 +222,14 @@ class Terms:
         step = round(float(np.log(half_angle)) / _FILTER_STEP)
         if step not in self._filtered:
             sizes = np.array([NARROW, WIDE]) * np.exp(step * _FILTER_STEP) / PIXEL
-            margin = int(np.ceil(6 * sizes[1])) + 2  # two Gaussians of three standard deviations
+            margin = 2 * int(_reach(sizes[1]))
             near = tuple(slice(max(0, part.start - margin), part.stop + margin) for part in (self._rows, self._columns))
-            part = self._images[:, *near], self._inside[near], sizes[0], sizes[1], self._used[near]
-            rows, columns = (
+            inner = tuple(
                 slice(part.start - whole.start, part.stop - whole.start)
                 for part, whole in zip((self._rows, self._columns), near, strict=True)
             )
-            self._filtered[step] = np.ascontiguousarray(local_contrast(*part)[:, rows, columns], np.float32)
+            part = self._images[:, *near], self._inside[near], *sizes, self._used[near], inner
+            self._filtered[step] = np.ascontiguousarray(local_contrast(*part), np.float32)
         return self._filtered[step]
 
 
@@ -268,6 +292,7 @@ def refine_contrast(
     The radius is that of the field of view [mm], the bounds are those of the scale [mm/rad].
     """
     places, areas = places_of()
+    places = places.astype(np.float32)
     limits = np.log(bounds)
     local: dict[tuple[float, float], Floats] = {}
 
@@ -275,13 +300,13 @@ def refine_contrast(
         key = float(geometry[3]), float(geometry[4])
         if key not in local:  # rotations do not change them
             local.clear()
-            local[key] = directions_of(places, radius, math.exp(geometry[3]), geometry[4])
-        return local[key] @ (rotation_of(geometry[:3]) @ start.matrix)
+            local[key] = directions_of(places, radius, math.exp(key[0]), key[1])
+        return local[key] @ (rotation_of(geometry[:3]) @ start.matrix).astype(np.float32)
 
     def sample(images, *geometries):
         """Pictures of one image for several geometries, or of several images for one."""
         at = np.concatenate([directions(geometry) for geometry in geometries])
-        pictures = sampled(images, terms.equal(at), terms.corner).reshape(-1, len(places))
+        pictures = sampled(images, terms.equal(at), terms.corner).astype(float).reshape(-1, len(places))
         return pictures - (pictures @ areas)[:, None]
 
     def judged(geometry):

@@ -529,7 +529,7 @@ class _Crystal:
     def densities(self) -> Floats:
         """Densities of the patterns, smoothed for the bins, shape (k, m, m)."""
         sigma = resolution(self.view.disc, math.sqrt(self.scales[0] * self.scales[1]))
-        return np.concatenate([pattern.smoothed(sigma) for pattern in self.patterns])
+        return np.concatenate([pattern.smoothed(sigma) for pattern in self.patterns], dtype=np.float32)
 
     def starts(self, n: int = _STARTS) -> list[Start]:
         """Best `n` orientations of the search by every criterion."""

@@ -101,8 +101,7 @@ class JointSearch:
         # of an axis and its mirror image the pattern is the same, with the azimuth reversed
         self._turns = np.stack([about_axis(axis) for axis in axes_of(terms.structure, AXIS_STEP)])
         self._terms, self._patterns = terms, [smoothed_pattern(pattern) for pattern in patterns]
-        areas = places_of()[1].astype(np.float32)
-        contrast = scipy.fft.rfft((picture.astype(np.float32) * areas).reshape(RINGS, AZIMUTHS), axis=1)
+        contrast = scipy.fft.rfft(picture.astype(np.float32).reshape(RINGS, AZIMUTHS), axis=1)
         steps = int(np.ceil(np.log(scales[1] / scales[0]) / SCALE_STEP))
         self._slices: list[_Slice] = []
         costs = []
@@ -134,25 +133,31 @@ class JointSearch:
         terms, n = self._terms, len(turns)
         places, areas = places_of()
         areas = areas.astype(np.float32)
-        directions = (directions_of(places, radius, scale, 0.0) @ turns).reshape(-1, 3)
-        pictures, (row, column) = terms.at(directions, radius / scale)
+        directions = directions_of(places.astype(np.float32), radius, scale, 0.0) @ turns.astype(np.float32)
+        pictures, (row, column) = terms.at(directions.reshape(-1, 3), radius / scale)
         pictures = pictures.reshape(len(pictures), n, -1).swapaxes(0, 1)
-        pictures = pictures - (pictures @ areas)[..., None]
-        pictures /= np.maximum(np.sqrt(pictures**2 @ areas), 1e-3)[..., None]
-        ridge = ((pictures * areas) @ pictures.swapaxes(1, 2)).astype(float) + np.diag(1 / (PIECES * terms.priors**2))
+        # means and norms are taken off the products, as the map has a mean of 0
+        weighted, means = pictures * areas, pictures @ areas
+        gram = weighted @ pictures.swapaxes(1, 2) - means[..., None] * means[:, None]
+        norms_of_terms = np.maximum(np.sqrt(np.maximum(np.einsum("nkk->nk", gram), 0)), 1e-3)
+        gram /= norms_of_terms[..., None] * norms_of_terms[:, None]
+        ridge = gram.astype(float) + np.diag(1 / (PIECES * terms.priors**2))
         volume = np.linalg.slogdet(PIECES * terms.priors[:, None] * ridge * terms.priors)[1]
-        spectra = scipy.fft.rfft(pictures.reshape(n, -1, RINGS, AZIMUTHS), axis=3)
+        spectra = scipy.fft.rfft(weighted.reshape(n, -1, RINGS, AZIMUTHS), axis=3)
+        of_contrast = _products(spectra, contrast) / norms_of_terms[:, None, :, None]
         slow, weights = slow_of_pictures()
         slow, root = slow.astype(np.float32), np.sqrt(weights).astype(np.float32)
         pixels = row * (2 * HALF + 1) + column
         densities = np.concatenate([pattern.reshape(2, -1).take(pixels, axis=1) for pattern in self._patterns])
         densities = np.minimum(densities, BRIGHTEST).reshape(-1, n, RINGS * AZIMUTHS).swapaxes(0, 1) * root
-        densities = (densities - (densities @ slow) @ slow.T).reshape(n, len(self._patterns), 2, -1)
-        products = (densities @ densities.swapaxes(2, 3)).astype(float)
+        # slow changes are taken off the products, as the flattened map has none
+        changes = (densities @ slow).reshape(n, len(self._patterns), 2, -1)
+        densities = densities.reshape(n, len(self._patterns), 2, -1)
+        products = (densities @ densities.swapaxes(2, 3) - changes @ changes.swapaxes(2, 3)).astype(float)
         norms = np.maximum(np.einsum("npkk->npk", products), 1e-30)
         inverse_counts = np.linalg.inv(products + 1e-6 * norms.sum(axis=2)[..., None, None] * np.eye(2))
         of_counts = scipy.fft.rfft(densities.reshape(*densities.shape[:3], RINGS, AZIMUTHS), axis=4)
-        return _products(spectra, contrast), _products(of_counts, counts), ridge, volume, norms, inverse_counts
+        return of_contrast, _products(of_counts, counts), ridge, volume, norms, inverse_counts
 
     def _values(self, phases):
         """Both criteria without marks, shape (2, slices, axes, azimuths), with these factors of the harmonics."""
@@ -220,10 +225,12 @@ def _products(spectra, picture):
 
     Both hands: of the mirrored pattern the spectrum is not conjugated, so of the map it is.
     """
-    # real and imaginary parts apart: four sums for both hands
-    real, imaginary = (np.einsum("...rf,rf->...f", part, picture.real) for part in (spectra.real, spectra.imag))
-    crossed, other = (np.einsum("...rf,rf->...f", part, picture.imag) for part in (spectra.real, spectra.imag))
-    return np.stack([real + other + 1j * (crossed - imaginary), real - other + 1j * (crossed + imaginary)], axis=1)
+    # sums with the real and with the imaginary part of the picture, of both parts of the spectra side by side
+    real, imaginary = (
+        np.einsum("...rf,rf->...f", spectra.view(part.dtype), part.repeat(2, axis=1)).view(spectra.dtype)
+        for part in (picture.real, picture.imag)
+    )
+    return np.stack([real.conj() + 1j * imaginary.conj(), real + 1j * imaginary], axis=1)
 
 
 @lru_cache(maxsize=32)

@@ -177,15 +177,15 @@ class MasterPattern:
 def sampled(densities: Floats, directions: Floats, corner: tuple[int, int] = (0, 0)) -> Floats:
     """Densities on the disc, shape (k, n, n), at unit vectors of shape (m, 3), by linear interpolation, (k, m).
 
-    A part of the disc begins at the row and the column of `corner`.
+    A part of the disc begins at the row and the column of `corner`. Both in float32 give densities in float32.
     """
     height, width = densities.shape[1:]
     row, column = pixels_of(directions)
     row, column = np.clip(row - corner[0], 0, height - 1), np.clip(column - corner[1], 0, width - 1)
     # the four pixels about a place and their weights are those of all densities
-    top, left = np.minimum(row.astype(np.intp), height - 2), np.minimum(column.astype(np.intp), width - 2)
+    top, left = np.minimum(np.floor(row), height - 2), np.minimum(np.floor(column), width - 2)
     down, right = row - top, column - left
-    first = top * width + left
+    first = (top * width + left).astype(np.intp)
     flat = densities.reshape(len(densities), -1)
     upper = flat.take(first, axis=1) * (1 - right) + flat.take(first + 1, axis=1) * right
     first += width

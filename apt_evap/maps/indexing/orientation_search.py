@@ -212,7 +212,7 @@ def axes_of(structure: str, step: float) -> Floats:
     points = np.column_stack([np.sqrt(1 - z**2) * np.cos(phi), np.sqrt(1 - z**2) * np.sin(phi), z])
     # of all equal directions the one closest to a general direction
     general = np.array([0.36, 0.12, 0.93])
-    return points[[np.all(group @ point @ general <= point @ general + 1e-12) for point in points]]
+    return points[(points @ (general @ group).T <= (points @ general)[:, None] + 1e-12).all(axis=1)]
 
 
 def about_axis(axis: Floats) -> Floats:
