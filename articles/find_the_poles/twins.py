@@ -3,9 +3,9 @@
     python twins.py RUNS simulate Pt Ta     # runs of some tips, all by default: half an hour of one core
     python twins.py RUNS index Pt Ta        # eight maps of each; --wrong: as another structure
     python twins.py RUNS index Pt --draw 1 --maps 4 --ions 20000    # other maps, of 20,000 ions or more
-    python twins.py RUNS bicrystals Pt --maps 2                     # two grains in a map, the second 5 to 50 % of it
+    python twins.py RUNS bicrystals Pt --second 0.25 0.5            # two grains in a map, the second 25 to 50 % of it
     python twins.py RUNS structureless --maps 20                    # rings, gradients, stripes, spots
-    python twins.py RUNS simulate Cu --long                         # a longer run, for lenses
+    python twins.py RUNS simulate Cu --long                         # a longer run: no ion is in one of its maps twice
     python twins.py RUNS lenses Cu --maps 10                        # scale and its error, of lenses of -20 to 20 %
     python twins.py RUNS rim Cu --maps 20                           # ten of one grain, ten with 4 to 12 % of another
 
@@ -280,7 +280,8 @@ def main():
     parser.add_argument("--maps", type=int, default=8, help="maps of each tip, or without structure")
     parser.add_argument("--ions", type=int, default=4_000, help="fewest ions of a map")
     parser.add_argument("--draw", type=int, default=0, help="other maps of the same tips")
-    parser.add_argument("--long", action="store_true", help="simulate the runs of `lenses` and `rim`")
+    parser.add_argument("--second", type=float, nargs=2, default=(0.05, 0.5), help="part of the second grain")
+    parser.add_argument("--long", action="store_true", help="longer runs, those of `lenses` and `rim`")
     options = parser.parse_args()
     options.runs.mkdir(parents=True, exist_ok=True)
     elements = options.elements or list(TIPS)
@@ -292,8 +293,8 @@ def main():
         return
     scales = []
     for element in elements:
-        once = options.what in ("lenses", "rim")
-        path = path_of(options.runs, element, options.long or once)
+        once = options.long or options.what in ("lenses", "rim")
+        path = path_of(options.runs, element, once)
         if options.what == "simulate":
             if not path.exists():
                 simulated(element, options.long).save(path)
@@ -310,7 +311,7 @@ def main():
         for number in range(options.maps):
             seed, second = 10_000 * options.draw + 100 * TIPS[element][4] + number, 0.0
             if options.what == "bicrystals":
-                seed, second = seed + 50, float(np.random.default_rng(seed + 50).uniform(0.05, 0.5))
+                seed, second = seed + 50, float(np.random.default_rng(seed + 50).uniform(*options.second))
             if options.what == "rim" and 2 * number >= options.maps:
                 second = float(np.random.default_rng(seed).uniform(0.04, 0.12))
             detector_map, projection, turn, what = crystal.map(seed, options.ions, second)

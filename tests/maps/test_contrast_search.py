@@ -19,7 +19,7 @@ from apt_evap.maps.indexing.contrast_search import (
     terms_of,
 )
 from apt_evap.maps.indexing.joint_search import CONTRAST, JointSearch
-from apt_evap.maps.indexing.master_pattern import master_patterns, nearest_pixels
+from apt_evap.maps.indexing.master_pattern import HALF, PIXEL, master_patterns, nearest_pixels
 from apt_evap.maps.indexing.orientation_search import Start, disc_of, misorientation
 from apt_evap.maps.indexing.refine import directions_of
 from apt_evap.specimen.symmetry import point_group
@@ -119,16 +119,28 @@ def test_lines_and_poles_are_there_in_all_four_quarters_of_the_disc(element):
     angles = np.degrees(np.arccos(np.abs(directions @ crystal.normals.T).max(axis=1)))
     assert (line[sines < 0.01] > 1.85).all() and (line[sines > 0.11] < 1.05).all()
     assert (pole[angles < 0.7] < 0.5).all() and (pole[angles > 12] > 0.9).all()
+    # what is filtered is a part of the filtered disc
+    inside = np.hypot(*(np.indices((2 * HALF + 1,) * 2) - HALF)) * PIXEL <= np.sqrt(2)
+    sizes = np.array([module.NARROW, module.WIDE]) * np.exp(-10 * module._FILTER_STEP) / PIXEL
+    whole = local_contrast(terms._images[first : first + 1], inside, *sizes, terms._used)
+    part = terms.images(np.exp(-10 * module._FILTER_STEP))[first]
+    top, left = terms.corner
+    assert part == pytest.approx(whole[0, top : top + part.shape[0], left : left + part.shape[1]], abs=1e-4)
 
 
-def direct_evidence(disc, patterns, matrix, scale):
-    """Evidence of an orientation, without Fourier transforms."""
-    terms = Terms(ae.material("Ni"), patterns)
+def normalised(terms, disc, matrix, scale):
+    """Pictures of the terms in an orientation, with a mean of 0 and a variance of 1."""
     places, areas = module.places_of()
     directions = directions_of(places, disc.radius, scale, 0.0) @ matrix
     pictures = terms.at(directions, disc.radius / scale)[0].astype(float)
     pictures -= (pictures @ areas)[:, None]
-    pictures /= np.sqrt(pictures**2 @ areas)[:, None]
+    return pictures / np.sqrt(pictures**2 @ areas)[:, None]
+
+
+def direct_evidence(disc, patterns, matrix, scale):
+    """Evidence of an orientation, without Fourier transforms."""
+    terms, areas = Terms(ae.material("Ni"), patterns), module.places_of()[1]
+    pictures = normalised(terms, disc, matrix, scale)
     cross = (pictures * areas) @ module.picture_of(disc)
     return evidence((pictures * areas) @ pictures.T, cross[:, None], terms.priors, terms.signed)[0]
 
@@ -168,7 +180,11 @@ def test_the_search_is_the_direct_evidence(monkeypatch):
     disc = disc_of(map_of_lines(orientation, 0.6))
     patterns = master_patterns("fcc")
     terms, picture = Terms(ae.material("Ni"), patterns), module.picture_of(disc)
-    start = JointSearch(disc, picture, terms, patterns, (SCALE, SCALE)).starts(CONTRAST, 1)[0]
+    search = JointSearch(disc, picture, terms, patterns, (SCALE, SCALE))
+    start = search.starts(CONTRAST, 1)[0]
+    pictures = normalised(terms, disc, search._turns[7], SCALE)
+    ridge = (pictures * module.places_of()[1]) @ pictures.T + np.diag(1 / (PIECES * terms.priors**2))
+    assert search._slices[0].ridge[7] == pytest.approx(ridge, abs=2e-3)
     # both take the nearest pixel, of equal directions that are not the same
     direct = direct_evidence(disc, patterns, start.matrix, SCALE)
     assert start.score == pytest.approx(direct, rel=0.1) and start.score > 50

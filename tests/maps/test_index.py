@@ -26,7 +26,7 @@ from apt_evap.maps.indexing.orientation_search import (
     flattened_by_rings,
     misorientation,
 )
-from apt_evap.maps.indexing.refine import bins_of, deviance, refine, rotation_of
+from apt_evap.maps.indexing.refine import _Likelihood, _State, bins_of, deviance, refine, rotation_of
 from apt_evap.maps.indexing.two_criteria import angle_between
 from apt_evap.specimen.symmetry import point_group
 
@@ -278,6 +278,31 @@ def test_refinement_never_lowers_the_likelihood():
     # the model of these counts is right: their deviations are Poisson's, and not correlated
     assert last.dispersion == pytest.approx(1.0, abs=0.25) and last.explained == pytest.approx(1.0, abs=0.1)
     assert deviance(bins.counts, bins.counts + 1e-12) == pytest.approx(0, abs=1e-6)
+
+
+def test_the_normal_equations_are_the_derivatives_of_the_likelihood():
+    orientation, map = made("fcc", (0.30, 0.54, 0.79), 20.0)
+    disc = disc_of(map)
+    bins, densities = bins_of(disc), master_patterns("fcc")[0].smoothed(1.5)
+    geometry = np.array([0.03, 0.0, -0.02, np.log(SCALE), 0.02])
+    likelihood = _Likelihood(bins, disc, densities, orientation.matrix, (), None, geometry, 0.05)
+    state = _State(bins.fit, np.array([0.3, 0.4]), geometry, likelihood.contrasts(geometry))
+    normal, right = likelihood.normal_equations(state, moving=True)
+
+    def moved(k, by):
+        numbers = np.concatenate(state[:3])
+        numbers[k] += by
+        fit, amplitudes, geometry = np.split(numbers, np.cumsum([len(part) for part in state[:2]]))
+        return _State(fit, amplitudes, geometry, likelihood.contrasts(geometry))
+
+    for k in range(len(right)):
+        states = [moved(k, by) for by in (-2e-3, 2e-3)]
+        low, high = (likelihood.value(state) for state in states)
+        scale = np.sqrt(normal[k, k])
+        assert (low - high) / 8e-3 / scale == pytest.approx(right[k] / scale, abs=1.0), k
+        low, high = (likelihood.expected(state)[0] for state in states)
+        by_counts = ((high - low) ** 2 / 16e-6 / likelihood.expected(state)[0]).sum()
+        assert normal[k, k] == pytest.approx(by_counts + (400.0 if k == len(right) - 1 else 0), rel=0.1), k
 
 
 @pytest.mark.parametrize("mirror", [False, True])

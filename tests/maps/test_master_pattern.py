@@ -5,7 +5,7 @@ import pytest
 from rough import ROUGH
 
 import apt_evap as ae
-from apt_evap.maps.indexing.master_pattern import MasterPattern, master_patterns
+from apt_evap.maps.indexing.master_pattern import HALF, MasterPattern, master_patterns, sampled
 from apt_evap.specimen.symmetry import point_group
 
 
@@ -107,6 +107,13 @@ def test_a_saved_pattern_is_read_back(few, tmp_path):
     assert np.abs(np.sqrt(again.densities) - np.sqrt(clipped)).max() <= 0.5 * np.sqrt(8) / 255 + 1e-9
     again.save(tmp_path / "again.npz")
     assert (tmp_path / "again.npz").read_bytes() == (tmp_path / "mine.npz").read_bytes()
+
+
+def test_a_part_of_a_pattern_ends_with_its_last_pixels():
+    part = np.arange(16.0).reshape(1, 4, 4)
+    towards_x, towards_y = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    found = sampled(part, np.stack([towards_x, towards_y, towards_x + towards_y]), (HALF, HALF))[0]
+    assert found == pytest.approx([3.0, 12.0, 15.0])
 
 
 def test_a_map_has_the_ions_and_the_poles_of_its_pattern():
