@@ -76,8 +76,9 @@ def phase_sizes(
     Notes
     -----
     A uniform ellipsoid has semi-axes of :math:`\sqrt 5` times its standard deviations. Those of the local scatter are
-    taken off. The errors are the changes by one standard error of each constant, which act on all ions together, and
-    the counts; half of what was taken off is added. Phases of fewer than 50 ions are left out.
+    taken off. The errors are the changes by one standard error of each constant, and those of
+    `EvolvingReconstruction.recession_changes`, which act on all ions together, and the counts; half of what was taken
+    off is added. Phases of fewer than 50 ions are left out.
 
     A phase that goes on beyond the field of view has the size of what is seen of it.
     """
@@ -92,6 +93,7 @@ def phase_sizes(
         for name, error in errors.items()
         if error
     ]
+    moved += [usual + change for change in reconstruction.recession_changes()]
     found = []
     for one, feature in reconstruction.found_features:
         near = _near(usual, feature.members)

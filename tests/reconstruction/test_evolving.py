@@ -74,7 +74,13 @@ def test_with_a_phase_inside_the_rim_is_followed_if_the_matrix_is_even_there_els
     assert ("the flux is that of the crystal, 0.88 of the view" in found.verdict) == (way == "both")
     rim = found._followed[1].rim or 1.0
     assert rim == pytest.approx(1.0 if way == "ring" else 0.88, abs=0.01)
-    (change,) = found.recession_changes()  # to the voltage alone: of two measures, half of their difference
+    change, *crystal = found.recession_changes()  # to the voltage alone: of two measures, half of their difference
+    # an eighth of the flux at the rim is the crystal's: a quarter of what this changes is in doubt
+    assert len(crystal) == (way == "both")
+    for doubt in crystal:
+        even, uneven = (EvolvingSurface(found.sequence).integrate(rim=one).positions for one in (1.0, rim))
+        np.testing.assert_allclose(doubt, 2 * (1 - rim) * (uneven - even), atol=1e-12)
+        assert np.abs(doubt[:, 2]).max() > 0.01
     by_rim = EvolvingSurface(found.sequence).integrate(rim=rim).positions - [0, 0, 13.0]
     by_mean = by_rim if way == "ring" else by_rim + change
     np.testing.assert_allclose(found.specimen_positions, by_mean, atol=1e-9)
@@ -331,6 +337,11 @@ def test_at_the_rim_the_errors_of_fields_and_voltage_are_those_of_the_recession(
     usual = found.again(found.sequence)
     (phase,) = found.phases
     np.testing.assert_array_equal(by_field, found.again(found.sequence, changes=[phase.error]) - usual)
+    # in a narrow view the volume tells of it, too
+    narrow = replace(found, _followed=(found._followed[0], found._followed[1]._replace(rim=0.75)))
+    *same, by_volume = narrow.recession_changes()
+    np.testing.assert_array_equal(same, [by_voltage, by_field])
+    np.testing.assert_array_equal(by_volume, (found.again(found.sequence, by="volume") - usual) / 2)
     # a voltage that is too high by 1.7 % is that of a sphere that recedes more slowly until it is curved less
     assert 0.005 < np.abs(by_voltage[:, 2]).mean() < 0.05
     # what is changed is what is reconstructed, but for one more pass of the fixed point
@@ -378,9 +389,19 @@ def test_the_next_fields_are_where_a_straight_line_gives_what_it_is_given():
 
 
 @pytest.mark.slow
-def test_a_phase_at_the_rim_that_is_not_flat_is_left_to_the_cap():
+def test_a_phase_at_the_rim_that_is_not_flat_is_left_to_the_cap(monkeypatch):
     hits, _ = ions_of(8000, voltage=varying(8000))
     places = ae.reconstruct(hits, radius=13.0, **KNOWN).positions
     ball = np.linalg.norm(places - (5.5, 0.0, places[:, 2].mean()), axis=1) < 1.0
     found = evolving(hits, labels=ball.astype(int))
     assert found.verdict.startswith("cap: a phase reaches the rim") and "is not flat" in found.verdict
+    sentence = "; the view is too narrow for it, and its thickness by the cap is not to be trusted"
+    assert sentence not in found.verdict
+    plain = module.continued
+
+    def mostly(*given):
+        outside, ways = plain(*given)
+        return outside, [replace(one, share=0.51) for one in ways]
+
+    monkeypatch.setattr(module, "continued", mostly)
+    assert evolving(hits, labels=ball.astype(int)).verdict.endswith(sentence)

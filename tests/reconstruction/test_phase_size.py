@@ -26,6 +26,13 @@ def test_a_ball_has_its_size_and_the_constants_its_errors():
     assert size.lateral == pytest.approx(np.sqrt(5 * variances[:2].mean()), rel=0.02)
     assert size.depth == pytest.approx(np.sqrt(5 * variances[2]), rel=0.02)
     assert size.lateral_error == pytest.approx(size.lateral / np.sqrt(2 * ball.sum()), rel=0.1)
+    # what the recession is not sure about: depths that may be larger by a tenth
+    tenth = found.positions[:, 2:] * (0.0, 0.0, -0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(found), "recession_changes", lambda self: [tenth])
+        (unsure,) = ae.reconstruction.phase_sizes(found, EXACT, local=(0.0, 0.0))
+    change = np.sqrt(unsure.depth_error**2 - size.depth_error**2)
+    assert change == pytest.approx(0.1 * size.depth, rel=0.01) and unsure.depth == size.depth
     # 10 % more efficiency: a tenth less of depth, and the same width
     (deeper,) = ae.reconstruction.phase_sizes(found, EXACT | {"efficiency": 0.1}, local=(0.0, 0.0))
     change = np.sqrt(deeper.depth_error**2 - size.depth_error**2)
