@@ -221,7 +221,7 @@ def lines_of(geometry, way, rows, of):
     """Lines of the table of one method, one for each phase."""
     followed = [row for row in rows if not row.get("verdict", "").startswith("cap")]
     of += f", {len(rows) - len(followed)} left to the cap" if len(followed) < len(rows) else ""
-    label, parts = GEOMETRIES[geometry], PARTS.get(geometry, ("first", "second"))
+    label, parts = GEOMETRIES[geometry], PARTS.get(geometry.split(" (")[0], ("first", "second"))
     if not followed:
         yield [f"{label}, {of}", way, *[""] * 7]
         return
