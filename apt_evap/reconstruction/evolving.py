@@ -56,8 +56,9 @@ planes of Fe [001], 0.007 for spheres, 0.033 for a layer of 1.15 times the field
 
 RIM_GATE = 0.09
 """Largest difference to 1 of the flux at the rim over that of the whole view in stretches of matrix: 0.00 to 0.08 in
-views of 30 and 35 degrees of aluminium with spheres, 0.09 to 0.13 in 25 degrees. Beyond, it is that of the crystal, and
-depths by it alone are 0.33 in place of 0.07 nm (sphere of 0.8)."""
+views of 30 and 35 degrees of aluminium with spheres, 0.09 to 0.13 in 25 degrees, but less in two of fifteen: there the
+depths of a sphere of 0.8 have 0.30 nm, worse than by the cap. Beyond, it is that of the crystal, and depths by it alone
+are 0.33 in place of 0.07 nm (sphere of 0.8)."""
 
 VOLTAGE_ERROR = 0.017
 """Relative error of V F = F_evap: RMS of V F / F_evap - 1 in the matrix of a pure specimen and of three with spheres,
