@@ -180,7 +180,7 @@ def _top(ax: Axes, result):
 
 
 class _Places:
-    """Places along the axis as blocks of ions, nm in place of mm: together they are a second array of all."""
+    """Places seen along the axis as blocks of ions, nm in place of mm: kept together they would be a second array."""
 
     available: tuple[str, ...] = ("x", "y")
     columns = available
