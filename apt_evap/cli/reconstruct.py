@@ -3,6 +3,7 @@
 import argparse
 import math
 from pathlib import Path
+from typing import Any
 
 from apt_evap.cli._declared_options import add_declared
 from apt_evap.cli._options import MATERIAL_HELP, add_reading, add_real_units, add_speech, add_time_zero, numbers_type
@@ -223,7 +224,7 @@ class _Extent:
     def __init__(self) -> None:
         self._low, self._high = [math.inf] * 3, [-math.inf] * 3
 
-    def add(self, positions) -> None:
+    def add(self, positions: Any) -> None:
         """Take the positions of some ions."""
         import numpy as np
 
@@ -235,7 +236,7 @@ class _Extent:
             self._high[axis] = max(self._high[axis], float(column.max(initial=-math.inf)))
 
     @property
-    def lengths(self):
+    def lengths(self) -> list[float] | None:
         """Lengths of the extent [nm], None without any."""
         lengths = [high - low for low, high in zip(self._low, self._high, strict=True)]
         return lengths if max(lengths) > 0 and all(map(math.isfinite, lengths)) else None
