@@ -80,7 +80,7 @@ def main():
     parser.add_argument("--ions", type=int, default=20_000_000)
     parser.add_argument("--turns", type=int, default=3)
     options = parser.parse_args()
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # compiling the modules anew would be measured
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else compiling the modules would be measured
     turns = {name: [] for name in COMMANDS}
     with tempfile.TemporaryDirectory() as folder:
         writer = multiprocessing.get_context("spawn").Process(
@@ -88,6 +88,8 @@ def main():
         )
         writer.start()
         writer.join()
+        if writer.exitcode:
+            raise SystemExit("the file was not written: is apt_evap of this PYTHONPATH compiled?")
         for turn in range(options.turns + 1):  # the first one writes bytecode
             for name, words in COMMANDS.items():
                 found = measured(words, folder)

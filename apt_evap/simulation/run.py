@@ -198,10 +198,10 @@ class Run(RunTable):
         >>> ae.Simulation(tip, seed=1).run(100).sites()
         <PointCloud: 100 ions from 'sites of the run', 3.9 x 4.0 x 3.5 nm; Ni 51, Al 49>
         """
-        names = tuple(dict.fromkeys(self.elements))  # phases may share an element
-        number = np.array([names.index(element) for element in self.elements])
         from apt_evap.measures.point_cloud import PointCloud  # a map must not wait for it
 
+        names = tuple(dict.fromkeys(self.elements))  # phases may share an element
+        number = np.array([names.index(element) for element in self.elements])
         return PointCloud(self.emissions.positions, number[self.species], names, source="sites of the run")
 
     def places(
