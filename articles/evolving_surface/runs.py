@@ -21,6 +21,7 @@ import apt_evap as ae
 ALUMINIUM = ae.material("Al")
 VOLUME = ALUMINIUM.a**3 / 4  # nm^3
 R = 12.0  # nm
+AXIS = 0, 1, 2
 COVER, BELOW, SIZE = 0.8, 1.2, 3.2  # nm: matrix above and below a sphere, its radius
 SMALL = 2.2  # nm: radius of a sphere in a large specimen
 ROLLING = 3.25  # energies at 1,000 V over those at the voltage of a measurement
@@ -67,10 +68,11 @@ def alloy(region, share):
 
 
 def case(name):
-    """Phases beside the matrix, angle of the shank [degrees], emissions and radius of the apex [nm] of a case."""
+    """Phases beside the matrix, angle of the shank [degrees], emissions, radius of the apex [nm] and axis of a case."""
     name, *words = name.split("-")
     shank = next((float(word.removeprefix("shank")) for word in words if word.startswith("shank")), 1.5)
     apex = next((float(word.removeprefix("R")) for word in words if word.startswith("R")), R)
+    axis = next((tuple(map(int, word.removeprefix("axis"))) for word in words if word.startswith("axis")), AXIS)
     emissions = {"rest": ae.Unperturbed()}
     if "rolled" in words:
         emissions["metal"] = ae.RollUp.of_metal("Al", energy_scale=ROLLING)
@@ -97,22 +99,24 @@ def case(name):
         ],
     }
     if name == "alloy_sphere":
-        return alloy(ball(0, 0, SIZE, COVER, apex), 0.4), shank, emissions, apex
-    return [ae.specimen.Phase("matrix", ALUMINIUM), *phases[name]()], shank, emissions, apex
+        return alloy(ball(0, 0, SIZE, COVER, apex), 0.4), shank, emissions, apex, axis
+    return [ae.specimen.Phase("matrix", ALUMINIUM), *phases[name]()], shank, emissions, apex, axis
 
 
 CASES = (
     "pure:1-5 sphere_low:1-5 sphere_high:1-5 layer_high:1-5 two_spheres:1-5 layer_low-shank10:1-5 layer40_high:1 "
-    "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_high-rolled:1"
+    "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_small-R30:1 "
+    "sphere_high-rolled:1 sphere_low-axis111:1 sphere_high-axis111:1 core_shell-axis111:1 sphere_low-axis001:1 "
+    "sphere_high-axis001:1 sphere_low-axis011:1 sphere_high-axis011:1"
 ).split()  # fmt: skip
 
 
 def evaporate(name, seed, folder):
     """Evaporate a case and keep what a reconstruction and its judgement need."""
-    phases, shank, emissions, apex = case(name)
-    offset = 100 * seed + sum(map(ord, name)) % 97
+    phases, shank, emissions, apex, axis = case(name)
+    offset = 100 * seed + sum(map(ord, name.split("-axis")[0])) % 97
     tip = ae.Tip(
-        phases=phases, apex_radius=apex, axis=(0, 1, 2), shank_angle=shank, shank_length=2 * apex, depth=11.0,
+        phases=phases, apex_radius=apex, axis=axis, shank_angle=shank, shank_length=2 * apex, depth=11.0,
         offset_seed=offset, seed=offset,
     )  # fmt: skip
     size = SMALL if name.startswith("sphere_small") else SIZE
@@ -129,7 +133,7 @@ def evaporate(name, seed, folder):
 
 def twin(folder):
     """A smaller specimen of the matrix alone, whose errors are those of the emission and the lattice."""
-    tip = ae.Tip("Al", apex_radius=6.0, axis=(0, 1, 2), shank_angle=1.5, shank_length=12.0, depth=11.4,
+    tip = ae.Tip("Al", apex_radius=6.0, axis=AXIS, shank_angle=1.5, shank_length=12.0, depth=11.4,
                  offset_seed=301, seed=301)  # fmt: skip
     simulation = ae.Simulation(tip, seed=301, rule=ae.ConstantPotential(), n_threads=1)
     run = simulation.run(int(8.4 * np.pi * 6**2 / VOLUME), [ae.Unperturbed()], responses=False, progress=False)

@@ -34,13 +34,19 @@ GEOMETRIES = {
     "two_spheres": "two small spheres, 0.8 and 1.2", "layer_low-shank10": "layer, 0.85, shank of 10°",
     "layer40_high": "layer at 40°, 1.15", "layer40_low": "layer at 40°, 0.85", "sphere_edge": "sphere at the rim, 0.85",
     "core_shell": "shell of 1.15 and core of 0.85", "alloy_sphere": "sphere of 40 % in 2 %",
-    "sphere_small-R20": "sphere, 0.8, R = 20 nm", "sphere_high-rolled (metal)": "sphere, 1.2, rolling of aluminium",
+    "sphere_small-R20": "sphere, 0.8, R = 20 nm", "sphere_small-R30": "sphere, 0.8, R = 30 nm",
+    "sphere_high-rolled (metal)": "sphere, 1.2, rolling of aluminium",
     "sphere_high-rolled (all)": "sphere, 1.2, all ions roll", "grains": "two grains",
 }  # fmt: skip
 GEOMETRIES |= {
     f"{name} ({angle}°)": f"{GEOMETRIES[name]}, half angle of {angle}°"
     for angle in (20, 25)
     for name in ("pure", "sphere_low", "sphere_high", "layer_high", "two_spheres", "core_shell")
+}
+GEOMETRIES |= {
+    f"{name}-axis{axis}": f"{GEOMETRIES[name]}, axis [{axis}]"
+    for axis in ("111", "001", "011")
+    for name in ("sphere_low", "sphere_high", "core_shell")
 }
 PHASE_FIELDS = {
     "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
@@ -180,7 +186,7 @@ def compare(path, emission="rest", chosen=None, twin=None, half_angle=HALF_ANGLE
     """One case by all methods, or by some, and with a twin: lists of rows of the table."""
     name = path.stem.rsplit("_", 1)[0]
     base = name.split("-")[0]
-    phases, shank, _, apex = runs.case(name)
+    phases, shank, _, apex, _ = runs.case(name)
     regions = [one.region for one in phases[1:]]
     radius = RADIUS * apex / runs.R
     growth = {"radius": radius, "half_angle": half_angle}
