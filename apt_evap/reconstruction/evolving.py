@@ -870,7 +870,8 @@ def _verdict(fixed, measured, why):
     """One sentence on what the surface was followed by."""
     share = max((way.share for way in fixed.ways), default=0.0)
     jumps = f"; {measured.jumps} jumps or restarts of the voltage were taken out" if measured.jumps else ""
-    crystal = f", where the matrix has {fixed.flux:.2f} of that of the view" if fixed.flux < 1 else ""
+    flux = f"{fixed.flux:.2f}"
+    crystal = f", where the matrix has {flux} of that of the view" if flux != "1.00" else ""
     if fixed.way == "volume":
         found = "no phase is known"
         if measured.names:
