@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Booleans, Floats
 from apt_evap._common.validation import check_kind
@@ -14,7 +15,7 @@ from apt_evap.reconstruction.evolving import EvolvingReconstruction
 from apt_evap.reconstruction.position_errors import (
     LOCAL_SCATTER,
     changed_sequence,
-    constant_errors_of,
+    constant_changes,
     local_covariances,
 )
 
@@ -50,7 +51,7 @@ class PhaseSize(NamedTuple):
 
 def phase_sizes(
     reconstruction: EvolvingReconstruction,
-    constant_errors: Mapping[str, float] | None = None,
+    constant_errors: Mapping[str, float] | ArrayLike | None = None,
     local: Sequence[float] = LOCAL_SCATTER,
 ) -> list[PhaseSize]:
     r"""Sizes of the phases that an evolving surface has found.
@@ -59,8 +60,8 @@ def phase_sizes(
     ----------
     reconstruction : EvolvingReconstruction
         A reconstruction whose surface was followed.
-    constant_errors : mapping, optional
-        Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
+    constant_errors : mapping or array_like, optional
+        As for `position_covariances`.
     local : sequence of float
         Scatter of the ions along the surface and across it [nm], as for `position_covariances`; it widens a phase.
 
@@ -83,16 +84,12 @@ def phase_sizes(
     A phase that goes on beyond the field of view has the size of what is seen of it.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
-    errors = constant_errors_of(constant_errors)
+    constants = constant_changes(constant_errors)
     if reconstruction.history is None:
         raise ValueError(f"reconstruction must have a surface that was followed, got {reconstruction.verdict!r}")
     usual = reconstruction.again(reconstruction.sequence)
     blurred = np.einsum("nii->ni", local_covariances(reconstruction.sequence, local))
-    moved = [
-        reconstruction.again(changed_sequence(reconstruction, name, 1 + error))
-        for name, error in errors.items()
-        if error
-    ]
+    moved = [reconstruction.again(changed_sequence(reconstruction, change)) for change in constants]
     moved += [usual + change for change in reconstruction.recession_changes()]
     found = []
     for one, feature in reconstruction.found_features:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_choice, check_kind, check_number
+from apt_evap._common.validation import check_array, check_choice, check_kind, check_number, short_text
 from apt_evap.reconstruction.evolving import EvolvingReconstruction
 from apt_evap.reconstruction.evolving_surface import IonSequence
 from apt_evap.reconstruction.twin_correction import without_means
@@ -30,7 +31,7 @@ _CLOSE, _NEAR = 4, 24  # neighbours over which corrections of halves, and their 
 
 def position_covariances(
     reconstruction: EvolvingReconstruction,
-    constant_errors: Mapping[str, float] | None = None,
+    constant_errors: Mapping[str, float] | ArrayLike | None = None,
     local: Sequence[float] | None = None,
 ) -> Floats:
     """Covariance of the position of each ion.
@@ -39,8 +40,9 @@ def position_covariances(
     ----------
     reconstruction : EvolvingReconstruction
         A reconstruction whose surface was followed.
-    constant_errors : mapping, optional
-        Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out.
+    constant_errors : mapping or array_like, optional
+        Relative standard errors of "compression", "radius" and "efficiency"; 0.05 for those that are left out. Or their
+        relative covariances in this order, shape (3, 3), such as `CrystalConstants.covariance`.
     local : sequence of float, optional
         Scatter of the ions about their neighbours along the surface and across it [nm], such as `local_scatter` of a
         simulated specimen of the same matrix. By default what the mean errors of the twin leave, with half of them
@@ -60,14 +62,14 @@ def position_covariances(
     Notes
     -----
     The sum of four parts: half the difference of two reconstructions, each from half of the ions, smoothed over 24
-    neighbours; the change by one standard error of each constant; what the recession is not sure about, see
-    `EvolvingReconstruction.recession_changes`, averaged over 24 ions of about the same direction at any time if no
-    phase is at the rim; and the local scatter, which comes from the emission and the lattice and is not seen
-    in any measurement. An ion whose place on the surface is wrong is moved along it: far from the axis this changes its
-    depth, too.
+    neighbours; the change by one standard error of each constant, or of each of their independent combinations; what
+    the recession is not sure about, see `EvolvingReconstruction.recession_changes`, averaged over 24 ions of about the
+    same direction at any time if no phase is at the rim; and the local scatter, which comes from the emission and the
+    lattice and is not seen in any measurement. An ion whose place on the surface is wrong is moved along it: far from
+    the axis this changes its depth, too.
     """
     check_kind(reconstruction, "reconstruction", EvolvingReconstruction, "an EvolvingReconstruction")
-    errors, ions = constant_errors_of(constant_errors), reconstruction.sequence
+    constants, ions = constant_changes(constant_errors), reconstruction.sequence
     usual = reconstruction.again(ions)
     sphere = ions.radius * ions.directions - np.array([0, 0, 1]) * ions.depths[1:, None]
     if local is None:
@@ -84,11 +86,7 @@ def position_covariances(
     half = (corrections[0] - corrections[1]) / 2
     half -= half.mean(axis=0)
     total += _mean_products(half, sphere)
-    changes = [
-        reconstruction.again(changed_sequence(reconstruction, name, 1 + error)) - usual
-        for name, error in errors.items()
-        if error
-    ]
+    changes = [reconstruction.again(changed_sequence(reconstruction, change)) - usual for change in constants]
     if reconstruction.followed_by != "surface":  # a draw: where two measures agree by chance neither is sure
         for change in reconstruction.recession_changes():
             total += _mean_products(change - change.mean(axis=0), ions.directions)
@@ -145,25 +143,33 @@ def local_scatter(reconstruction: EvolvingReconstruction, sites: ArrayLike) -> t
     return math.sqrt(max(float(along.mean()), 0.0)), float(np.sqrt((across**2).mean()))
 
 
-def constant_errors_of(given: Mapping[str, float] | None) -> dict[str, float]:
-    """Relative standard errors of all constants: those that are given, else 0.05."""
-    errors = dict(CONSTANT_ERRORS)
-    for name, value in (given or {}).items():
-        check_choice(name, "constant_errors", tuple(CONSTANT_ERRORS))
-        errors[name] = check_number(value, f"constant_errors[{name!r}]", at_least=0, below=0.5)
-    return errors
+def constant_changes(given: Mapping[str, float] | ArrayLike | None) -> list[Any]:
+    """Relative changes of compression, radius and efficiency that are independent, by one standard error each."""
+    if given is None or isinstance(given, Mapping):
+        errors = dict(CONSTANT_ERRORS)
+        for name, value in (given or {}).items():
+            check_choice(name, "constant_errors", tuple(CONSTANT_ERRORS))
+            errors[name] = check_number(value, f"constant_errors[{name!r}]", at_least=0, below=0.5)
+        changes = np.diag(list(errors.values()))
+    else:
+        covariance = check_array(given, "constant_errors", (3, 3))
+        variances, directions = np.linalg.eigh(covariance)
+        if np.abs(covariance - covariance.T).max() > 1e-9 or variances[0] < -1e-9 or variances[-1] >= 0.25:
+            raise ValueError(f"constant_errors must be covariances below 0.25, got {short_text(covariance.tolist())}")
+        changes = np.sqrt(np.maximum(variances, 0))[:, None] * directions.T
+    return [change for change in changes if change.any()]
 
 
-def changed_sequence(reconstruction: EvolvingReconstruction, name: str, factor: float) -> IonSequence:
-    """The ions with one constant times a factor."""
+def changed_sequence(reconstruction: EvolvingReconstruction, changes: Sequence[float]) -> IonSequence:
+    """The ions with relative changes of compression, radius and efficiency."""
+    compression, radius, efficiency = (1 + change for change in changes)
     ions = reconstruction.sequence
-    if name == "radius":
-        return replace(ions, radius=ions.radius * factor)
-    if name == "efficiency":
-        return replace(ions, volume=ions.volume / factor)
+    ions = replace(ions, radius=ions.radius * radius, volume=ions.volume / efficiency)
+    if compression == 1:
+        return ions
     every = -(-len(reconstruction) // len(ions.directions))
     hits, radii = reconstruction.hits[::every], reconstruction.radii[::every]
-    geometry = replace(reconstruction.geometry, compression=reconstruction.geometry.compression * factor)
+    geometry = replace(reconstruction.geometry, compression=reconstruction.geometry.compression * compression)
     places, angles = geometry.places(hits, radii)
     rim = float(np.mean(geometry.rim_angles(hits, radii)))
     return replace(ions, directions=np.column_stack([places, np.cos(angles)]), rim=rim)

@@ -209,6 +209,16 @@ def test_covariances_are_the_sum_of_halves_constants_and_local_scatter():
     # 10 % more efficiency: depths 1/1.1 of theirs, whose standard deviation about their mean is that of an even ramp
     spread = found.depths[-1] / np.sqrt(12)
     assert np.sqrt(depth[:, 2, 2].mean()) == pytest.approx(spread * (1 - 1 / 1.1), rel=0.1)
+    # given as covariances: the same, and less where a smaller radius makes up for a larger compression
+    errors = np.diag([0.03, 0.04, 0.02]) ** 2
+    told = ae.reconstruction.position_covariances(found, errors)
+    known = {"compression": 0.03, "radius": 0.04, "efficiency": 0.02}
+    np.testing.assert_allclose(told, ae.reconstruction.position_covariances(found, known), atol=1e-12)
+    errors[0, 1] = errors[1, 0] = -0.03 * 0.04
+    assert np.einsum("nii->", ae.reconstruction.position_covariances(found, errors)) < 0.9 * np.einsum("nii->", told)
+    for wrong in (np.eye(3), -errors, errors + 0.01 * np.eye(3)[[1, 2, 0]]):
+        with pytest.raises(ValueError, match=r"constant_errors must be covariances below 0\.25"):
+            ae.reconstruction.position_covariances(found, wrong)
     assert np.linalg.eigvalsh(local).min() > 0
     assert ae.reconstruction.local_scatter(found, found.specimen_positions) == pytest.approx((0, 0), abs=1e-12)
     # ions that are moved along a sphere: far from the axis their depths change, their distance from its centre does not
