@@ -38,6 +38,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "example:\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --efficiency 0.57 -o R5083.pos\n"
         "  apt-evap reconstruct R5083.epos --element Si --distance 90 --ranges R5083.rrng\n"
+        "  apt-evap reconstruct R5083.epos --element Al --distance 90 --efficiency 0.57 --calibrate\n"
         "  apt-evap reconstruct ni111.h5 --real-units\n"
         "  apt-evap reconstruct R5083.epos --element Al --distance 90 --efficiency 0.57 --shape evolving \\\n"
         "      --ranges R5083.rrng --solutes Mg,Zn\n"
@@ -92,6 +93,12 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     add_declared(constants, "reconstruction.reconstruction_settings", "ReconstructionSettings", _CONSTANTS)
     constants.add_argument("--element", metavar="NAME", help=f"gives atomic volume and field: {MATERIAL_HELP}")
     constants.add_argument("--radius", metavar="R", help="voltage, shank, or a constant radius [nm]; default: voltage")
+    constants.add_argument(
+        "--calibrate",
+        action="store_true",
+        help="compression, and radius or field factor, from the poles of the map and the spacing of their planes; "
+        "needs --element, radius or field factor to start from",
+    )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     add_time_zero(constants)
     parser.add_argument("--peaks", metavar="NAME", help="only the ions in the peaks of this element; default: all ions")
@@ -140,7 +147,11 @@ def execute(options: argparse.Namespace) -> int:
         material, axis = _crystal(options, settings, crystal)
     origins = None if options.origins is None else OriginTable.load(options.origins)
     selection = file.select(hits, note)
-    reconstruction = reconstruct(selection, origins=origins, **_surface(options, selection, ranges), **settings)
+    surface, calibrated = _surface(options, selection, ranges), None
+    if options.calibrate:
+        calibrated = _calibrate(options, selection, surface, settings)
+        settings |= calibrated.constants
+    reconstruction = reconstruct(selection, origins=origins, **surface, **settings)
     figure, done = None, f"no picture of fewer than {FEWEST} ions"
     if options.picture is not None or len(reconstruction) >= FEWEST:
         if isinstance(reconstruction, EvolvingReconstruction) and reconstruction.history is not None:
@@ -159,6 +170,8 @@ def execute(options: argparse.Namespace) -> int:
         result["picture"] = str(picture)
     result["settings"] = for_json(reconstruction.settings)
     result["assumed"] = [one._asdict() for one in assumed]
+    if calibrated is not None:
+        result["calibrated"] = calibrated.to_dict()
     if isinstance(reconstruction, EvolvingReconstruction):
         result["surface"] = _tell_surface(options, reconstruction)
     if options.check is not None:
@@ -262,6 +275,18 @@ def _surface(options, hits, ranges):
             )
         arguments["labels"] = hits.extra[options.labels]
     return arguments
+
+
+def _calibrate(options, hits, surface, settings):
+    """Constants that the crystal determines, which are told."""
+    from apt_evap.fit.crystal_constants import constants_of_crystal
+
+    if "element" not in settings:
+        raise ValueError("--calibrate needs --element, got none")
+    known = {name: value for name, value in surface.items() if name != "twin"}
+    found = constants_of_crystal(hits, **known, **settings)
+    tell(options, str(found))
+    return found
 
 
 def _tell_surface(options, reconstruction):

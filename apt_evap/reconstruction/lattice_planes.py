@@ -10,7 +10,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from apt_evap._common.types import Floats
-from apt_evap._common.validation import check_array, check_number, check_seed
+from apt_evap._common.validation import check_array, check_count, check_number, check_seed
 from apt_evap.reconstruction.calibration import (
     DistributionMap,
     distribution_map,
@@ -23,7 +23,6 @@ _LATERAL = 0.5  # largest distance of two ions across the normal [nm]
 _SEARCH_VECTORS = 80_000  # pairs of the search; some 20,000 of them are counted for a normal: an amplitude within 0.01
 _MOST_VECTORS = 2_000_000  # pairs for the error of the spacing
 _BINS = 200  # of a distance along the normal
-_SCATTERED = 19  # specimens without planes: chance gives a sharper one than all of them in 1 of 20 cases
 _GROUPS = 8  # of ions, left out in turn for the error of the spacing
 
 
@@ -41,7 +40,7 @@ class LatticePlanes:
         Standard error of the spacing [nm].
     amplitude : float
         Amplitude of the search, which `by_chance` compares with.
-    by_chance : ndarray, shape (19,)
+    by_chance : ndarray, shape (n,)
         Amplitudes of the same search in the same ions without planes: shifted along z at random, by up to the reach.
     """
 
@@ -53,8 +52,8 @@ class LatticePlanes:
 
     @property
     def found(self) -> bool:
-        """Whether the planes are sharper than those that chance makes in 19 specimens without planes."""
-        return bool(self.amplitude > self.by_chance.max())
+        """Whether the planes are sharper than those that chance makes in all specimens without planes."""
+        return bool(self.amplitude > self.by_chance.max(initial=0.0))
 
     @property
     def spacing(self) -> float:
@@ -67,7 +66,8 @@ class LatticePlanes:
         return math.degrees(math.acos(min(1.0, float(self.normal[2]))))
 
     def __str__(self) -> str:
-        without = f"1 of {len(self.by_chance) + 1} specimens without planes has more than {self.by_chance.max():.3f}"
+        sharpest = self.by_chance.max(initial=0.0)
+        without = f"1 of {len(self.by_chance) + 1} specimens without planes has more than {sharpest:.3f}"
         chance = f"amplitude {self.amplitude:.3f}; {without}"
         ions = f"of {self.distances.references:,} ions"
         if not self.found:
@@ -87,6 +87,7 @@ def find_planes(
     widest: float = 10.0,
     reach: float = 1.0,
     seed: int = 0,
+    scattered: int = 19,
 ) -> LatticePlanes:
     """Lattice planes in a cylinder of reconstructed ions: their spacing, and the normal for which they are sharpest.
 
@@ -104,6 +105,8 @@ def find_planes(
         Largest distance of two ions along the normal [nm]; several spacings.
     seed : int
         Seed of the random shifts and of the choice of pairs.
+    scattered : int
+        Specimens without planes that the amplitude is compared with; of 0 planes are always `found`.
 
     Returns
     -------
@@ -117,8 +120,9 @@ def find_planes(
     Notes
     -----
     Normals about 2 degrees apart are compared with 80,000 pairs of ions, then refined by a simplex. A search always
-    finds a sharpest normal. So it is repeated in 19 specimens without planes: the same ions, shifted along z at random.
-    The error of the spacing is that of the jackknife, with an eighth of the ions left out in turn.
+    finds a sharpest normal. So it is repeated in specimens without planes: the same ions, shifted along z at random. By
+    chance one is sharper than 19 of these in 1 of 20 cases. The error of the spacing is that of the jackknife, with an
+    eighth of the ions left out in turn.
 
     Examples
     --------
@@ -140,8 +144,8 @@ def find_planes(
         raise ValueError(f"the cylinder must hold at least {_FEWEST} ions, got {len(chosen)}")
     rng = np.random.default_rng(check_seed(seed))
     normal, amplitude = _sharpest(chosen, widest, reach, rng)
-    by_chance = np.empty(_SCATTERED)
-    for number in range(_SCATTERED):
+    by_chance = np.empty(check_count(scattered, "scattered"))
+    for number in range(len(by_chance)):
         shifts = rng.uniform(-reach, reach, len(chosen))
         by_chance[number] = _sharpest(chosen + shifts[:, None] * (0, 0, 1), widest, reach, rng)[1]
     distances = distribution_map(chosen, normal, reach=reach)

@@ -787,7 +787,13 @@ def test_every_public_name_with_arguments_is_in_the_table():
     taken |= {"chunks", "precipitate_errors", "likeness"}  # in test_chunks, test_precipitate, test_verdict
     taken |= {"write_nodes", "write_types", "describe"}  # in test_tapsim_nodes, test_main
     taken |= {"index", "indexing", "MasterPattern", "master_patterns", "master_pattern"}  # in tests/maps
-    taken |= {"Measurement", "constants_of", "settings_of", "density_gains"}  # in tests/fit, tests/maps
+    taken |= {
+        "Measurement",
+        "constants_of",
+        "constants_of_crystal",
+        "settings_of",
+        "density_gains",
+    }  # in tests/fit, tests/maps
     taken |= {"PointCloud", "CompositionField", "TriangleMesh", "ConvexHull", "label_clusters"}  # in tests/measures
     taken |= {"compare_with_truth", "corrected", "truth_comparison"}  # in tests/reconstruction
     taken |= {"assumptions", "local_scatter", "position_covariances", "check_specimen", "phase_sizes"}

@@ -3,6 +3,7 @@
 import json
 import re
 from argparse import Namespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from rough import ROUGH
 import apt_evap as ae
 from apt_evap.cli import reconstruct
 from apt_evap.cli.main import main
+from apt_evap.fit import crystal_constants
+from apt_evap.fit.crystal_constants import CrystalConstants, PoleSpacing
 from apt_evap.reconstruction.constants import run_constants
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.phase_size import PhaseSize
@@ -59,6 +62,25 @@ def test_measured_ions(measured, nickel, tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["ions"] == 500 and result["settings"]["shank_angle"] == 5.0 and "errors" not in result
     assert len(ae.read("shank.epos")) == 500
+
+
+def test_constants_of_the_crystal(measured, monkeypatch, capsys):
+    poles = (PoleSpacing((0, 0, 2), 1.01, 0.004, SimpleNamespace(found=True), True),)
+    constants = {"compression": 1.4, "projection": "compressed", "field_factor": 3.1}
+    found, given = CrystalConstants(constants, np.eye(3) / 1000, poles, None), {}
+    monkeypatch.setattr(crystal_constants, "constants_of_crystal", lambda hits, **more: given.update(more) or found)
+    command = ["reconstruct", "ni.epos", "--distance", "90", "--calibrate", "--force", "--ions", "0,40"]
+    assert main([*command, "--element", "Ni", "--field-factor", "3.5"]) == 0
+    assert given["shape"] == "cap" and given["field_factor"] == 3.5 and "twin" not in given
+    told = capsys.readouterr().out
+    assert "compression 1.400 ± 3.2%, field factor 3.1 ± 3.2%, correlation of compression and radius 0.00; " in told
+    assert "field_factor 3.1, evaporation_field 35, compression 1.4" in told and "assumed efficiency" in told
+    assert main([*command, "--element", "Ni", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["calibrated"]["constants"] == constants and result["settings"]["projection"] == "compressed"
+    assert result["calibrated"]["poles"] == [{"pole": [0, 0, 2], "ratio": 1.01, "error": 0.004, "is_used": True}]
+    assert main([*command, "--atomic-volume", "0.011", "--evaporation-field", "35"]) == 2
+    assert "--calibrate needs --element, got none" in capsys.readouterr().err
 
 
 def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nickel, capsys):

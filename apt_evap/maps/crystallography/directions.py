@@ -159,6 +159,12 @@ def plane_normals(material: Material, planes: ArrayLike, name: str = "planes") -
     return normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
+def plane_periods(material: Material, planes: ArrayLike) -> Floats:
+    """Distances after which the atomic planes of lattice planes repeat [nm], shape (n,), as for `plane_normals`."""
+    planes = _three(material, planes, "planes", lambda h, k, _, last: (h, k, last))
+    return 1 / np.linalg.norm(planes @ _reciprocal(material), axis=1)  # type: ignore[no-any-return]
+
+
 def direction_normals(material: Material, directions: ArrayLike) -> Floats:
     """Unit vectors (n, 3) along directions [u v w], for hcp also [u v t w], in the frame of the crystal."""
     directions = _three(material, directions, "directions", lambda u, v, t, w: (u - t, v - t, w))
