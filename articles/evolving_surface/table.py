@@ -14,7 +14,6 @@ over the seeds of each geometry), and ``sections.png``; with ``--half-angle 20``
 import argparse
 import json
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,6 @@ import runs
 import scipy
 
 import apt_evap as ae
-
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks" / "ground_truth"))
-import baselines
 
 RADIUS, COMPRESSION = 12.963, 1.0342  # fitted to the sites of the pure run, R = 12 nm
 EFFICIENCY, HALF_ANGLE, DISTANCE = 0.5, 30.0, 100.0
@@ -99,17 +95,16 @@ def reconstructed(hits, factors=(1.0, 1.0, 1.0), half_angle=HALF_ANGLE, **how):
     )  # fmt: skip
 
 
-def factors_of_map(hits, half_angle):
-    """Compression by the poles of the map, and radius by the planes of a pole, from 0.9 of the right one: over ours."""
-    given = {
-        "distance": DISTANCE, "efficiency": EFFICIENCY, "atomic_volume": runs.VOLUME, "crystal": "fcc",
-        "field_of_view": 2 * DISTANCE * np.tan(np.radians(half_angle)), "material": "Al", "a": runs.ALUMINIUM.a,
-    }  # fmt: skip
-    found, compression = baselines.orientation(hits, given)
-    radius = 0.9 * RADIUS
-    for _ in range(2):
-        radius = baselines.calibrated_radius(hits, given, found, radius, compression) or radius
-    return compression / COMPRESSION, radius / RADIUS, 1.0
+def constants_of_map(hits, half_angle, growth, how):
+    """Constants by the crystal, from 0.9 of the right radius: factors of ours, and their relative covariances."""
+    name = "initial_radius" if "initial_radius" in growth else "radius"
+    known = {key: value for key, value in how.items() if key != "half_angle"} | {name: 0.9 * growth[name]}
+    found = ae.fit.constants_of_crystal(
+        hits, element=runs.ALUMINIUM, distance=DISTANCE, detector_radius=DISTANCE * np.tan(np.radians(half_angle)),
+        efficiency=EFFICIENCY, efficiency_error=0.0, **known,
+    )  # fmt: skip
+    factors = found.constants["compression"] / COMPRESSION, found.constants[name] / growth[name], 1.0
+    return factors, found.covariance
 
 
 def measured(found, sites, phase, regions):
@@ -171,14 +166,14 @@ def ways_of(base, emission, regions):
     return ways
 
 
-def judged(found, truth, exact=True):
-    """Row of a reconstruction: what was measured, and how often its intervals hold the truth."""
+def judged(found, truth, errors=EXACT):
+    """Row of a reconstruction: what was measured, and how often its intervals hold the truth by errors of constants."""
     sites, phase, regions = truth
     row = measured(found, sites, phase, regions)
     if isinstance(found, ae.reconstruction.EvolvingReconstruction):
         row["verdict"], row["fields"] = found.verdict, [(one.ratio, one.error) for one in found.phases]
         if found.history is not None:
-            row["coverage"] = coverage(found, sites, EXACT if exact else None)
+            row["coverage"] = coverage(found, sites, errors)
     return row
 
 
@@ -204,10 +199,16 @@ def compare(path, emission="rest", chosen=None, twin=None, half_angle=HALF_ANGLE
         if way == "wrong constants":
             draws = 1 + 0.05 * rng.normal(size=(DRAWS, 3))
             rows["cap, wrong constants"] = [judged(reconstructed(hits, each, **growth), truth) for each in draws]
-            rows[way] = [judged(reconstructed(hits, each, **how), truth, exact=False) for each in draws]
+            rows[way] = [judged(reconstructed(hits, each, **how), truth, None) for each in draws]
             continue
-        factors = factors_of_map(hits, half_angle) if way == "constants of the map" else (1.0, 1.0, 1.0)
-        rows[way] = [judged(reconstructed(hits, factors, **how), truth)]
+        factors, errors = (1.0, 1.0, 1.0), EXACT
+        if way == "constants of the map":
+            try:
+                factors, errors = constants_of_map(hits, half_angle, growth, how)
+            except ValueError as error:  # such as no pole in a narrow view
+                print(f"{path.stem}, {way}: {error}", flush=True)
+                continue
+        rows[way] = [judged(reconstructed(hits, factors, **how), truth, errors)]
         if twin is not None and way in ("labels", "volume"):
             rows[f"{way}, twin"] = [judged(reconstructed(hits, twin=twin, **how), truth)]
     true = PHASE_FIELDS.get(base, [])

@@ -15,7 +15,6 @@ import h5py
 import numpy as np
 
 FIELD_FACTOR = 3.3  # of the literature; those of the specimens are 2.8 to 3.8
-FAMILIES = {"fcc": ((1, 1, 1), (0, 0, 2), (0, 2, 2)), "bcc": ((0, 1, 1), (0, 0, 2), (1, 1, 2))}
 STEP = 0.1  # nm, of profiles
 
 
@@ -33,7 +32,7 @@ def common(given):
 
 
 def orientation(hits, given):
-    """What `index` finds: the result, and the image compression of its first candidate (1 without one)."""
+    """What `index` finds on a map of the angles of flight: the result, and the image compression of the whole view."""
     import apt_evap as ae
 
     distance = float(given["distance"])
@@ -41,33 +40,9 @@ def orientation(hits, given):
     flat = distance * np.arctan(across / distance) / np.maximum(across, 1e-9)  # angles of flight in place of a plane
     hits = ae.Hits(x=flat * hits.x, y=flat * hits.y)
     found = ae.index(hits, given["material"], scales=(distance / 1.3, distance / 0.95))
-    return found, distance / found.best.projection.scale if found.candidates else 1.0
-
-
-def calibrated_radius(hits, given, found, radius, compression):
-    """Radius of the apex with which the planes of a pole have their spacing; None if no planes are found."""
-    import apt_evap as ae
-
-    for family in FAMILIES[given["crystal"]]:
-        pole = found.best.orientation.nearest_pole(family).direction
-        if pole[2] < np.cos(np.radians(32)):
-            continue
-        volume = ae.reconstruct(hits, radius=radius, compression=compression, **common(given))
-        # turned until the pole is along z, about the place where it leaves the surface
-        across = np.hypot(*pole[:2])
-        axis = np.array([-pole[1], pole[0], 0.0]) / max(across, 1e-12)
-        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        turn = np.eye(3) - across * cross + (1 - pole[2]) * cross @ cross
-        turned = volume.specimen_positions @ turn.T
-        at = (turn @ (radius * pole * (1, 1, 0) + (0, 0, np.median(volume.specimen_positions[:, 2]))))[:2]
-        try:
-            planes = ae.reconstruction.find_planes(turned, at, radius=1.0, reach=0.8)
-        except ValueError:
-            continue
-        spacing = float(given["a"]) / np.linalg.norm(family)
-        if planes.found and 0.5 < planes.spacing / spacing < 2:
-            return radius * np.sqrt(planes.spacing / spacing)
-    return None
+    if not found.candidates:
+        return found, 1.0
+    return found, distance / (found.best.projection.scale * (1 + found.best.rim_change))
 
 
 def normal_of_layers(positions, marked, tilts):
@@ -203,22 +178,32 @@ def by_this_package(folder, name):
                    extra={"element": columns["element"].astype(str)})  # fmt: skip
     found, compression = orientation(hits, given)
     radius = float(np.median(columns["voltage"])) / (FIELD_FACTOR * float(given["evaporation_field"]))
-    planes = calibrated_radius(hits, given, found, radius, compression) if found.candidates else None
-    radius = planes or radius
-    answers = {"apex radius": (radius, np.nan), "compression": (compression, np.nan)}
+    solutes = [solute for solute in (given["solute"], given["shell"]) if solute]
+    known, said = common(given) | {"radius": radius, "compression": compression}, "no orientation"
+    answers = {name: (value, np.nan) for name, value in (("apex radius", radius), ("compression", compression))}
+    if found.candidates:
+        material = ae.material(given["material"], a=float(given["a"]))
+        try:
+            crystal = ae.fit.constants_of_crystal(
+                hits, element=material, orientation=found.best.orientation, efficiency_error=0.0, shape="evolving",
+                solutes=solutes, **known,
+            )  # fmt: skip
+        except ValueError as error:
+            said = str(error)
+        else:
+            known, said = known | crystal.constants, str(crystal)
+            errors = np.sqrt(np.diag(crystal.covariance)) * (known["compression"], known["radius"], 1)
+            answers = {"apex radius": (known["radius"], errors[1]), "compression": (compression, errors[0])}
     if found.decided and "axis" in asked:
         axis = axis_of(found.best)
         answers |= {f"axis {index}": (value, np.nan) for index, value in zip("hkl", axis, strict=True)}
-    solutes = [solute for solute in (given["solute"], given["shell"]) if solute]
-    known = common(given) | {"radius": radius, "compression": compression}
     for method, options in (("cap", {}), ("evolving", {"shape": "evolving", "solutes": solutes})):
         volume = ae.reconstruct(hits, **known, **options)
         cloud = ae.measures.PointCloud.of(volume.hits, positions=volume.specimen_positions)
         measured = structure(cloud, given)
         write(folder / "answers" / method / f"{name}.h5", answers | measured, volume.specimen_positions, asked)
     seconds = time.process_time() - start
-    print(f"{name}: {found.verdict}, {'planes' if planes else 'no planes'}, radius {radius:.2f} nm, compression "
-          f"{compression:.3f}; {getattr(volume, 'verdict', '')}; {seconds:.0f} s of processor", flush=True)  # fmt: skip
+    print(f"{name}: {found.verdict}, {said}; {volume.verdict}; {seconds:.0f} s of processor", flush=True)
 
 
 def by_pyccapt(folder, name):
