@@ -69,6 +69,7 @@ def test_constants_of_the_crystal(measured, monkeypatch, capsys):
     constants = {"compression": 1.4, "projection": "compressed", "field_factor": 3.1}
     found, given = CrystalConstants(constants, np.eye(3) / 1000, poles, None), {}
     monkeypatch.setattr(crystal_constants, "constants_of_crystal", lambda hits, **more: given.update(more) or found)
+    monkeypatch.setattr(reconstruct, "_surface", lambda *_: {"shape": "cap", "ranges": None, "twin": None})
     command = ["reconstruct", "ni.epos", "--distance", "90", "--calibrate", "--force", "--ions", "0,40"]
     assert main([*command, "--element", "Ni", "--field-factor", "3.5"]) == 0
     assert given["shape"] == "cap" and given["field_factor"] == 3.5 and "twin" not in given
