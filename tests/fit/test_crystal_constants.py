@@ -38,7 +38,7 @@ def crystal(radius=10.0, depth=1.2, rim=25.0):
 @pytest.mark.parametrize(
     ("name", "right", "given"),
     [
-        ("radius", 10.0, {"radius": 8.0}),
+        ("radius", 10.0, {"radius": 9.0}),
         ("field_factor", FACTOR, {"evaporation_field": FIELD}),
         ("initial_radius", 10.0, {"radius": "shank", "initial_radius": 11.0, "shank_angle": 0.0}),
     ],
@@ -49,7 +49,7 @@ def test_the_radius_is_that_with_the_right_spacings(monkeypatch, name, right, gi
     monkeypatch.setattr(crystal_constants, "_FAMILIES", 3)
     find = crystal_constants.find_planes
     monkeypatch.setattr(
-        crystal_constants, "find_planes", lambda *a, scattered=2, **more: find(*a, scattered=scattered and 2, **more)
+        crystal_constants, "find_planes", lambda *a, scattered=1, **more: find(*a, scattered=scattered and 1, **more)
     )
     known = known | given | {"orientation": ALUMINIUM, "compression": COMPRESSION, "efficiency_error": 0.06}
     found = ae.fit.constants_of_crystal(hits, **known)
@@ -103,6 +103,14 @@ def test_poles_must_agree(monkeypatch, ratios, used, sentence):
     assert found.constants["radius"] == pytest.approx(10 * ratios[0] ** (6 / 2))  # they are the same after each of six
 
 
+def test_spacings_that_are_right_on_the_cap_are_not_settled_on_the_surface(monkeypatch):
+    hits, _, known = crystal()
+    ratios = iter((1.0, 1.2, 1.0, 1.0))
+    monkeypatch.setattr(crystal_constants, "_spacings", lambda *_, **__: spacings(next(ratios)))
+    found = ae.fit.constants_of_crystal(hits, orientation=ALUMINIUM, compression=COMPRESSION, radius=10.0, **known)
+    assert found.constants["radius"] == pytest.approx(10 * math.sqrt(1.2)) and found.covariance[1, 1] < 0.06**2
+
+
 def test_without_a_map_that_decides_one_pole_is_not_enough(monkeypatch):
     hits, _, known = crystal()
     best = SimpleNamespace(orientation=ALUMINIUM, projection=SimpleNamespace(scale=80.0), rim_change=0.25)
@@ -118,6 +126,11 @@ def test_without_a_map_that_decides_one_pole_is_not_enough(monkeypatch):
     found = ae.fit.constants_of_crystal(hits, radius=10.0, compressions=(1.0, 1.25), **known)
     assert found.constants["compression"] == 1.0 and found.indexing is told  # 80 mm/rad, a quarter more at the rim
     assert asked["scales"] == (80.0, 100.0)
+    assert found.covariance[0, 0] == pytest.approx(0.17**2)  # its rim is 25 degrees from the axis
+    sure = ae.fit.constants_of_crystal(hits, radius=10.0, compression_error=0.01, **known)
+    assert sure.covariance[0, 0] == pytest.approx(0.01**2)
+    with pytest.raises(ValueError, match=r"compression_error must be .* < 0\.5"):
+        ae.fit.constants_of_crystal(hits, radius=10.0, compression_error=0.5, **known)
     assert np.hypot(asked["hits"].x, asked["hits"].y).max() == pytest.approx(100 * math.radians(25), rel=0.01)
 
 
