@@ -244,7 +244,7 @@ def _mean(spacings: Sequence[PoleSpacing], reason: str) -> tuple[float, float, B
     ratios, errors = np.array([(one.ratio, one.error) for one in spacings]).reshape(-1, 2).T
     usable = np.array([one.planes.found for one in spacings], bool) & (ratios > _FACTORS[0]) & (ratios < _FACTORS[1])
     if not usable.any():
-        got = _texts(spacings) if spacings else "no pole in view"
+        got = _texts(spacings) if spacings else f"no pole with {_FEWEST} ions in view"
         raise ValueError(f"hits must have lattice planes at a pole, got {got}; {reason}")
     logs, errors = np.log(np.where(usable, ratios, 1.0)), np.hypot(errors / ratios, _OF_POLE)
     weights = np.where(usable, errors**-2.0, 0.0)

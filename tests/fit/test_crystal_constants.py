@@ -87,7 +87,7 @@ def spacings(*ratios, error=0.002):
         ((0.41, 1.0), None, "planes must agree at most poles, got spacings of planes over the true ones: 000 0.410 ± "
          r"0.002 \(not used\), 001 1.000 ± 0.002; the orientation is given"),
         ((-1.0, -0.9), None, "hits must have lattice planes at a pole, got spacings .* 000 none, 001 none; the orient"),
-        ((), None, "hits must have lattice planes at a pole, got no pole in view"),
+        ((), None, "hits must have lattice planes at a pole, got no pole with 50 ions in view"),
     ],
 )  # fmt: skip
 def test_poles_must_agree(monkeypatch, ratios, used, sentence):
