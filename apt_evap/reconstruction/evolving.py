@@ -46,6 +46,9 @@ FEWEST_IONS = 2000
 WIDEST_VIEW = 60.0
 """Largest half angle of the field of view [degrees]: beyond, the response of a sphere does not describe a specimen."""
 
+SHALLOWEST = 0.07
+"""Least depth over the radius for phases: the voltage is looked at from 0.065 on, as the first shape is not known."""
+
 EMISSION_GATE = 0.33
 """Largest contrast of the density of the matrix on the detector: 0.16 to 0.29 for aluminium at rest or as it rolls,
 0.34 to 0.47 if all ions roll, and then the surface is no better than the cap. No sign of rolling alone: W, Mg and Pt at
@@ -604,6 +607,10 @@ def _fixed_point(measured):
     contrast = _density_contrast(ions, others)
     if contrast > EMISSION_GATE:
         return f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
+    depth = ions.depths[-1]
+    if depth < SHALLOWEST * ions.radius:
+        why = f"a depth of {depth:.3g} nm is less than {SHALLOWEST:g} of the radius: no field of a phase follows from it"
+        return why if seen else nothing
     if not seen:
         swing = _voltage_swing(measured)
         if swing > VOLTAGE_GATE:

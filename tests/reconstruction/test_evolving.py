@@ -123,6 +123,9 @@ def test_few_ions_wide_views_and_rolled_ions_are_left_to_the_cap():
             of_passes()
     hits, _ = ions_of(half=1.1)
     assert evolving(hits).verdict == "cap: a half angle of 63 degrees on the cap, above 60"
+    hits, labels = ions_of(3000, voltage=varying(3000))
+    assert evolving(hits, labels=labels).verdict.startswith("cap: a depth of 0.71 nm is less than 0.07 of the radius")
+    assert evolving(hits).followed_by == "volume"  # of which no phase and no voltage is asked
     hits, _ = ions_of()
     rolled = replace(hits, x=hits.x * np.hypot(hits.x, hits.y) / 60, y=hits.y * np.hypot(hits.x, hits.y) / 60)
     assert "density of the matrix on the detector has a contrast of" in evolving(rolled).verdict
