@@ -176,7 +176,7 @@ def execute(options: argparse.Namespace) -> int:
         result["surface"] = _tell_surface(options, reconstruction)
     if options.check is not None:
         result["check"] = _tell_check(
-            options, reconstruction, material, axis, not options.check and crystal is None, rolled
+            options, reconstruction, material, axis, not options.check and crystal is None, rolled, calibrated
         )
     if hits.outcome is not None and len(reconstruction) > 2:  # simulated: the true sites are known
         errors = reconstruction.errors()
@@ -329,8 +329,10 @@ def _crystal(options, settings, crystal):
         raise ValueError(f"--check: {error}") from error
 
 
-def _tell_check(options, reconstruction, material, axis, assumed, rolled=False):
+def _tell_check(options, reconstruction, material, axis, assumed, rolled=False, calibrated=None):
     """Say whether a simulation of the specimen that was found confirms it; the same as numbers."""
+    import numpy as np
+
     from apt_evap.reconstruction.phase_size import phase_sizes
     from apt_evap.reconstruction.position_errors import CONSTANT_ERRORS, LOCAL_SCATTER, ROLLED_SCATTER
     from apt_evap.reconstruction.specimen_check import check_specimen
@@ -339,12 +341,15 @@ def _tell_check(options, reconstruction, material, axis, assumed, rolled=False):
         tell(options, "nothing to check: no evaporation field of a phase was found")
         return None
     scatter = ROLLED_SCATTER if rolled else LOCAL_SCATTER
-    sizes = phase_sizes(reconstruction, local=scatter)
+    errors = dict(CONSTANT_ERRORS)
+    if calibrated is not None:
+        errors = dict(zip(errors, np.sqrt(np.diag(calibrated.covariance)).tolist(), strict=True))
+    sizes = phase_sizes(reconstruction, None if calibrated is None else calibrated.covariance, scatter)
     for size in sizes:
         tell(options, str(size))
-    counted = {**CONSTANT_ERRORS, "scatter_along": scatter[0], "scatter_across": scatter[1]}
+    counted = {**errors, "scatter_along": scatter[0], "scatter_across": scatter[1]}
     if sizes:
-        constants = ", ".join(f"{name} {error:.0%}" for name, error in CONSTANT_ERRORS.items())
+        constants = ", ".join(f"{name} {100 * error:.2g}%" for name, error in errors.items())
         tell(
             options,
             f"errors of sizes count on {constants}, and on places along the surface that scatter by "

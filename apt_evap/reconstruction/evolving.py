@@ -609,7 +609,7 @@ def _fixed_point(measured):
         return f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
     depth = ions.depths[-1]
     if depth < SHALLOWEST * ions.radius:
-        why = f"a depth of {depth:.3g} nm is less than {SHALLOWEST:g} of the radius: no field of a phase follows from it"
+        why = f"a depth of {depth:.3g} nm is less than {SHALLOWEST:g} of the radius: no field follows from it"
         return why if seen else nothing
     if not seen:
         swing = _voltage_swing(measured)

@@ -108,7 +108,7 @@ def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nick
     # sizes count on the scatter of the emission
     rolled, plain = [], ae.Run.hits
     monkeypatch.setattr(ae.Run, "hits", lambda run, _: plain(run, ae.Unperturbed()))
-    monkeypatch.setattr(reconstruct, "_tell_check", lambda *arguments: rolled.append(arguments[-1]))
+    monkeypatch.setattr(reconstruct, "_tell_check", lambda *arguments: rolled.append(arguments[-2]))
     for emission in ("Unperturbed", "RollUp:0.2,0.1"):
         words = ["--shape", "evolving", "--check", "--perturbation", emission]
         assert main([*command, "--force", *words]) == 0
@@ -276,17 +276,25 @@ def test_the_precipitate_of_the_example_is_found_measured_and_confirmed(tmp_path
 
 
 def test_the_errors_of_sizes_are_said_with_what_they_count_on(monkeypatch, capsys):
-    size = PhaseSize("Cu", 99, 1.0, 0.7, 0.1, 0.1, 0.0)
+    size, told = PhaseSize("Cu", 99, 1.0, 0.7, 0.1, 0.1, 0.0), []
     checked = SpecimenCheck(*np.ones((3, 4, 2, 2)), explained=0.6, error=0.04, ions=9)
-    monkeypatch.setattr("apt_evap.reconstruction.phase_size.phase_sizes", lambda found, local: [size])
+    monkeypatch.setattr("apt_evap.reconstruction.phase_size.phase_sizes", lambda *given: told.append(given) or [size])
     monkeypatch.setattr("apt_evap.reconstruction.specimen_check.check_specimen", lambda *_, **__: checked)
     found = Namespace(phases=[Namespace(error=0.03)])
     reconstruct._tell_check(Namespace(json=False, quiet=False), found, ae.material("Al"), (0, 0, 1), False)
     out = capsys.readouterr().out
     assert "count on compression 5%, radius 5%, efficiency 5%" in out and "0.17 nm, as of ions at rest" in out
     assert "those of ions that roll scatter by 0.75 nm" in out
-    checked = reconstruct._tell_check(
+    numbers = reconstruct._tell_check(
         Namespace(json=False, quiet=False), found, ae.material("Al"), (0, 0, 1), False, rolled=True
     )
     assert "0.75 nm, as of ions that roll (Al" in capsys.readouterr().out
-    assert checked["errors_of_sizes"]["scatter_across"] == 0.078
+    assert numbers["errors_of_sizes"]["scatter_across"] == 0.078
+    assert told == [(found, None, (0.174, 0.057)), (found, None, (0.749, 0.078))]
+    # constants that the crystal has determined, with their correlations
+    calibrated = Namespace(covariance=np.diag([0.035, 0.012, 0.05]) ** 2)
+    reconstruct._tell_check(
+        Namespace(json=False, quiet=False), found, ae.material("Al"), (0, 0, 1), False, calibrated=calibrated
+    )
+    assert "count on compression 3.5%, radius 1.2%, efficiency 5%" in capsys.readouterr().out
+    assert told[-1][1] is calibrated.covariance
