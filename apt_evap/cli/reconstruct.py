@@ -97,7 +97,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "--calibrate",
         action="store_true",
         help="compression, and radius or field factor, from the poles of the map and the spacing of their planes; "
-        "needs --element, radius or field factor to start from",
+        "needs --element; starts from radius or field factor, within a factor of 1.4",
     )
     constants.add_argument("--origins", metavar="TABLE.npz", help="correct lateral positions by a table of origins")
     add_time_zero(constants)
@@ -283,6 +283,9 @@ def _calibrate(options, hits, surface, settings):
 
     if "element" not in settings:
         raise ValueError("--calibrate needs --element, got none")
+    for name in ("compression", "projection", "lens"):
+        if (given := getattr(options, name)) is not None:
+            raise ValueError(f"--calibrate finds a compression: --{name} must be left out, got {given}")
     known = {name: value for name, value in surface.items() if name != "twin"}
     found = constants_of_crystal(hits, **known, **settings)
     tell(options, str(found))

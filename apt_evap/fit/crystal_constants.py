@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apt_evap._common.codec import for_json
 from apt_evap._common.types import Booleans, Floats
-from apt_evap._common.validation import check_array, check_kind, check_number
+from apt_evap._common.validation import check_array, check_kind, check_number, short_text
 from apt_evap.detection.hits import Hits, MassRanges
 from apt_evap.maps.crystallography.directions import plain_label, plane_periods, poles
 from apt_evap.maps.crystallography.orientation import Orientation
@@ -44,7 +45,7 @@ _SETTLED = 0.003  # change of the radius in the last pass
 
 
 class PoleSpacing(NamedTuple):
-    """Lattice planes at a pole, in a reconstruction with the constants that were found."""
+    """Lattice planes at a pole, before the last change of the radius."""
 
     pole: tuple[int, ...]
     """Miller indices."""
@@ -89,7 +90,7 @@ class CrystalConstants:
         poles = [
             {"pole": one.pole, "ratio": one.ratio, "error": one.error, "is_used": one.is_used} for one in self.poles
         ]
-        return {"constants": self.constants, "covariance": self.covariance.tolist(), "poles": poles}
+        return {"constants": for_json(self.constants), "covariance": self.covariance.tolist(), "poles": poles}
 
     def __str__(self) -> str:
         compression, radius, _ = np.sqrt(np.diag(self.covariance))
@@ -141,7 +142,8 @@ def constants_of_crystal(
     Raises
     ------
     ValueError
-        If the map shows no orientation, no planes are found at its poles, or their spacings disagree.
+        If the map shows no orientation, no planes are found at its poles, or their spacings disagree; if the element is
+        missing or not that of the orientation, or a number out of range.
 
     Notes
     -----
@@ -150,20 +152,33 @@ def constants_of_crystal(
     within 1 nm of it on the surface at their time. Depths, and the spacings with them, go with
     :math:`1/(\eta R^2 \sin^2\theta_m)`: the radius is multiplied by the root of the mean ratio of the spacings to the
     true ones, without those that are more than 3 standard errors from their median, until it changes by less than
-    0.3 %, first by the cap. More than half of the poles with planes must agree, and two if the map does not decide.
+    0.3 %, at most six times, first by the cap; a last change is part of the error. More than half of the poles with
+    planes must agree, and two if the map does not decide. That they agree does not test the compression.
 
     The radius has the errors of the spacings, and follows an error of the compression by :math:`-\theta_m /
     \tan\theta_m` and one of the efficiency by -1/2, so positions are less wrong than by both errors alone.
     """
+    for name, right in (("projection", "compressed"), ("lens", None)):
+        if constants.get(name, right) != right:
+            raise ValueError(f"{name} must be left out: a compression is found, got {short_text(constants[name])}")
+    if orientation is not None and settings is None and "compression" not in constants:
+        raise ValueError("compression must be given with an orientation, got none: poles agree with a wrong one, too")
     known = resolved_settings(settings, {**constants, "projection": "compressed"})
     element = check_kind(known.element, "element", Material, "a Material, or a str of one")
+    if orientation is not None:
+        crystal = check_kind(orientation, "orientation", Orientation, "an Orientation").material
+        if (crystal.structure, crystal.a, crystal.c) != (element.structure, element.a, element.c):
+            raise ValueError(f"orientation must be of {element.name}, the element, got {crystal.name}")
     known_error = 0.0 if compression_error is None else compression_error
     for value, name in ((known_error, "compression_error"), (efficiency_error, "efficiency_error")):
         check_number(value, name, at_least=0, below=0.5)
     indexing, reason = None, "the orientation is given"
     if orientation is None:
         indexing = _index(hits, known, element, compressions)
-        reason, orientation = f"{indexing.verdict}: {indexing.reason}", indexing.best.orientation
+        reason, candidate = f"{indexing.verdict}: {indexing.reason}", indexing.best
+        # the z of a candidate is the centre of the ions: turned until it is the centre of the detector
+        turn = _turn(candidate.projection.directions([[0.0, 0.0]])[0])
+        orientation = Orientation.from_matrix(element, turn @ candidate.orientation.matrix)
         scale = indexing.best.projection.scale * (1 + indexing.best.rim_change)  # that of the whole view, at the rim
         known = replace(known, compression=known.distance / scale)
     surface: dict[str, Any] = {"shape": shape, "ranges": ranges, "solutes": solutes, "labels": labels}
@@ -194,6 +209,8 @@ def constants_of_crystal(
 def _index(hits, known, element, compressions):
     """What the map of the angles of flight shows."""
     least, largest = check_array(compressions, "compressions", (2,))
+    if not 0 < least < largest:
+        raise ValueError(f"compressions must be two numbers > 0, the smaller one first, got {short_text(compressions)}")
     x, y = (column.astype(np.float64) for column in hits[hits.detected].require("x", "y"))
     across = np.hypot(x, y)
     seen = across <= (known.detector_radius or math.inf)

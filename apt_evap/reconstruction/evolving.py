@@ -319,26 +319,27 @@ class EvolvingReconstruction(Reconstruction):
 
         By `VOLTAGE_ERROR`, and by the evaporation field of each phase, one standard error of it; without phases at the
         rim of the field of view by the voltage alone, which is one of two measures, or tells of it a second time. Where
-        the flux at the rim is that of the crystal, in narrow views, also by the other measure, the flux without this
-        correction or, with phases at the rim, the volume: times `CRYSTAL_DOUBT` and the part that is the crystal's.
+        the matrix has less of the flux at the rim, by its crystal, also by the other measure, the flux without this
+        correction or, with phases at the rim, the volume: times `CRYSTAL_DOUBT` and the part that it lacks.
         """
-        ions, measured = self.sequence, self._passes()[0]
-        known = self.followed_by == "volume" or any(one.error == one.error for one in self.phases)
+        ions, (measured, fixed) = self.sequence, self._passes()
+        usual = self.again(ions)
+        by_crystal = CRYSTAL_DOUBT * (1 - fixed.flux)
+        if fixed.way == "ring":
+            return [by_crystal * (usual - EvolvingSurface(ions).integrate().positions)] if by_crystal else []
+        known = fixed.way == "volume" or any(one.error == one.error for one in self.phases)
         if measured.voltages is None or not known:
             return []
-        usual = self.again(ions)
         if self.followed_by == "volume":
             level = float(np.mean(measured.voltages * EvolvingSurface(ions).integrate(recession="volume").fields))
             return [self.again(ions, voltage=1 / level, by="surface") - usual]
-        fixed = self._passes()[1]
-        by_crystal = CRYSTAL_DOUBT * (1 - fixed.flux)
         if fixed.way == "both":
             change = self.again(ions, by="surface") - usual
             if not by_crystal:
                 return [change]
             # what is followed is the mean of the voltage and of the flux over that of the crystal
             return [change, by_crystal * (usual - change - EvolvingSurface(ions).integrate().positions)]
-        errors = np.diag([one.error for one, _ in self.found_features])
+        errors = np.diag(np.nan_to_num([one.error for one, _ in self.found_features]))
         changes = [self.again(ions, voltage=1 + VOLTAGE_ERROR) - usual]
         changes += [self.again(ions, changes=error) - usual for error in errors]
         if by_crystal:
@@ -608,7 +609,7 @@ def _fixed_point(measured):
     if contrast > EMISSION_GATE:
         return f"the density of the matrix on the detector has a contrast of {contrast:.2f}, as if ions roll"
     depth = ions.depths[-1]
-    if depth < SHALLOWEST * ions.radius:
+    if depth < SHALLOWEST * ions.radius and (not seen or measured.voltages is not None):
         why = f"a depth of {depth:.3g} nm is less than {SHALLOWEST:g} of the radius: no field follows from it"
         return why if seen else nothing
     if not seen:
@@ -673,13 +674,14 @@ def _found_by_passes(measured, start, surface, ring, voltages, seen, halves):
         compositions, features = _features(measured, seen, start.contrasts, halves, found.positions, ratios)
         level = _level(voltages, found.fields, features, ions)
         new, errors[seen] = _found_fields(measured, features, compositions, values, found.positions)
-        last, used, given = (used, given), ratios[seen], np.clip(new, *_FIELD_LIMITS)
+        # of a phase whose ions are all at the beginning no field is known
+        last, used, given = (used, given), ratios[seen], np.clip(np.nan_to_num(new, nan=1.0), *_FIELD_LIMITS)
         if last[0] is not None and np.abs(given - used).max() < _SETTLED:
             break
         ratios = ratios.copy()
         ratios[seen] = np.clip(_extrapolated(used, given, *last), *_FIELD_LIMITS)
     ratios = ratios.copy()
-    ratios[seen] = given
+    ratios[seen] = np.where(np.isnan(new), np.nan, given)
     return start._replace(
         way=by, level=level, features=features, fields=thresholds, positions=before, ways=ways, ratios=ratios,
         errors=errors,
@@ -809,8 +811,8 @@ def _found_fields(measured, features, compositions, values, positions):
         cores = [core_of(one.own, share) for one, share in zip(features, near, strict=True)]
     best = ratios(later)
     left_out = np.array([ratios(later & (blocks != block)) for block in range(20)])
-    with np.errstate(invalid="ignore"):
-        scatter = np.sqrt(np.nansum((left_out - np.nanmean(left_out, axis=0)) ** 2, axis=0) * 19 / 20)
+    means = np.nansum(left_out, axis=0) / np.maximum(np.isfinite(left_out).sum(axis=0), 1)
+    scatter = np.sqrt(np.nansum((left_out - means) ** 2, axis=0) * 19 / 20)
     counting = [one.content_error / (one.content - one.background) for one in features]
     return best, np.sqrt(scatter**2 + ((best - 1) * np.hypot(_FIELD_BIAS, counting)) ** 2)
 
@@ -821,7 +823,7 @@ def _placed(cap, measured, fixed, every, why, thinned):
     surface = EvolvingSurface(ions)
     thresholds = np.repeat(fixed.fields, every)[: len(cap)]
     voltages = outside = None
-    if np.isfinite(fixed.errors).any():
+    if fixed.way in ("surface", "both"):
         depths = ions.depths[1:]
         voltages = measured.voltages / (fixed.trend[0] + fixed.trend[1] * depths) / fixed.level
         part = ions.part(0, every) if every > 1 else ions
@@ -894,4 +896,4 @@ def _verdict(fixed, measured, why):
     how = {way.way for way in fixed.ways} - {"none"}
     ways = {"plane": "continued as a plane", "ring": "continued from the ions at its azimuth"}
     beyond = f", {' and '.join(ways[way] for way in sorted(how))}" if how else ""
-    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{crystal}{beyond}{jumps}"
+    return f"followed by voltage and phases, up to {share:.2f} of the rim is of a phase{beyond}{jumps}"

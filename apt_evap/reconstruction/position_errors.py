@@ -156,8 +156,9 @@ def constant_changes(given: Mapping[str, float] | ArrayLike | None) -> list[Any]
         variances, directions = np.linalg.eigh(covariance)
         if np.abs(covariance - covariance.T).max() > 1e-9 or variances[0] < -1e-9 or variances[-1] >= 0.25:
             raise ValueError(f"constant_errors must be covariances below 0.25, got {short_text(covariance.tolist())}")
+        directions *= np.sign(directions[np.abs(directions).argmax(axis=0), range(3)])  # one of two signs
         changes = np.sqrt(np.maximum(variances, 0))[:, None] * directions.T
-    return [change for change in changes if change.any()]
+    return [change for change in changes if np.abs(change).max() > 1e-6]
 
 
 def changed_sequence(reconstruction: EvolvingReconstruction, changes: Sequence[float]) -> IonSequence:

@@ -82,6 +82,8 @@ def test_constants_of_the_crystal(measured, monkeypatch, capsys):
     assert result["calibrated"]["poles"] == [{"pole": [0, 0, 2], "ratio": 1.01, "error": 0.004, "is_used": True}]
     assert main([*command, "--atomic-volume", "0.011", "--evaporation-field", "35"]) == 2
     assert "--calibrate needs --element, got none" in capsys.readouterr().err
+    assert main([*command, "--element", "Ni", "--compression", "1.4"]) == 2
+    assert "--calibrate finds a compression: --compression must be left out, got 1.4" in capsys.readouterr().err
 
 
 def test_a_run_is_compared_with_its_sites(tmp_path, monkeypatch, small_tip, nickel, capsys):

@@ -105,23 +105,36 @@ def test_poles_must_agree(monkeypatch, ratios, used, sentence):
 
 def test_spacings_that_are_right_on_the_cap_are_not_settled_on_the_surface(monkeypatch):
     hits, _, known = crystal()
-    ratios = iter((1.0, 1.2, 1.0, 1.0))
+    ratios, shapes, plain = iter((1.0, 1.2, 1.0, 1.0)), [], crystal_constants.reconstruct
     monkeypatch.setattr(crystal_constants, "_spacings", lambda *_, **__: spacings(next(ratios)))
-    found = ae.fit.constants_of_crystal(hits, orientation=ALUMINIUM, compression=COMPRESSION, radius=10.0, **known)
+
+    def on_the_cap(hits, known, **how):
+        shapes.append(how.get("shape"))
+        return plain(hits, known)
+
+    monkeypatch.setattr(crystal_constants, "reconstruct", on_the_cap)
+    known = known | {"orientation": ALUMINIUM, "compression": COMPRESSION, "shape": "evolving"}
+    found = ae.fit.constants_of_crystal(hits, radius=10.0, **known)
+    assert shapes == [None, "evolving", "evolving", "evolving"]
     assert found.constants["radius"] == pytest.approx(10 * math.sqrt(1.2)) and found.covariance[1, 1] < 0.06**2
 
 
 def test_without_a_map_that_decides_one_pole_is_not_enough(monkeypatch):
     hits, _, known = crystal()
-    best = SimpleNamespace(orientation=ALUMINIUM, projection=SimpleNamespace(scale=80.0), rim_change=0.25)
+    # the ions have their centre 10 degrees from that of the detector, in x
+    away = np.array([-math.sin(math.radians(10)), 0.0, math.cos(math.radians(10))])
+    projection = SimpleNamespace(scale=80.0, directions=lambda places: np.tile(away, (len(places), 1)))
+    best = SimpleNamespace(orientation=ALUMINIUM, projection=projection, rim_change=0.25)
     told = SimpleNamespace(best=best, decided=False, verdict="undecided", reason="two are as good")
     asked = {}
     monkeypatch.setattr(
         crystal_constants, "index", lambda hits, material, **more: asked.update(more, hits=hits) or told
     )
-    monkeypatch.setattr(crystal_constants, "_spacings", lambda *_, **__: spacings(1.0))
+    used = []
+    monkeypatch.setattr(crystal_constants, "_spacings", lambda *given, **__: used.append(given[1]) or spacings(1.0))
     with pytest.raises(ValueError, match=r"planes must agree .*; undecided: two are as good"):
         ae.fit.constants_of_crystal(hits, radius=10.0, **known)
+    np.testing.assert_allclose(used[0].matrix @ ALUMINIUM.matrix.T @ away, [0, 0, 1], atol=1e-12)
     told.decided = True
     found = ae.fit.constants_of_crystal(hits, radius=10.0, compressions=(1.0, 1.25), **known)
     assert found.constants["compression"] == 1.0 and found.indexing is told  # 80 mm/rad, a quarter more at the rim
@@ -132,6 +145,22 @@ def test_without_a_map_that_decides_one_pole_is_not_enough(monkeypatch):
     with pytest.raises(ValueError, match=r"compression_error must be .* < 0\.5"):
         ae.fit.constants_of_crystal(hits, radius=10.0, compression_error=0.5, **known)
     assert np.hypot(asked["hits"].x, asked["hits"].y).max() == pytest.approx(100 * math.radians(25), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"orientation": ALUMINIUM}, "compression must be given with an orientation, got none"),
+        ({"orientation": ALUMINIUM, "compression": 1.0, "element": "Ni"}, "orientation must be of Ni, .* got Al"),
+        ({"orientation": "Al", "compression": 1.0}, "orientation must be an Orientation, got 'Al'"),
+        ({"projection": "bas"}, "projection must be left out: a compression is found, got 'bas'"),
+        ({"compressions": (1.25, 1.0)}, "compressions must be two numbers > 0, the smaller one first"),
+    ],
+)
+def test_what_contradicts_the_search_is_one_sentence(changes, sentence):
+    hits, _, known = crystal()
+    with pytest.raises((ValueError, TypeError), match=sentence):
+        ae.fit.constants_of_crystal(hits, **{**known, "radius": 10.0, **changes})
 
 
 @pytest.mark.slow
