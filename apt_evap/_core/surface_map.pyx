@@ -8,6 +8,10 @@ from libc.math cimport M_PI, acos, atan2, sqrt
 import numpy as np
 
 
+cdef enum:
+    LANES = 8
+
+
 cdef struct Cell:
     Py_ssize_t corner    # node above and before the place, and its neighbours
     Py_ssize_t beside
@@ -17,11 +21,12 @@ cdef struct Cell:
     double right
 
 
-cdef inline Cell cell_of(
-    double polar, double azimuth, Py_ssize_t rows, Py_ssize_t columns, double spacing
+cdef inline Cell cell_at(
+    double x, double y, double z, Py_ssize_t rows, Py_ssize_t columns, double spacing
 ) noexcept nogil:
     # Nodes of Gauss and Legendre are equidistant within 1e-3 of their spacing, symmetric about the equator.
     cdef Cell cell
+    cdef double polar = acos(min(max(y, -1.0), 1.0)), azimuth = atan2(x, z)
     cdef double row = (polar - (0.5 * M_PI - 0.5 * spacing * (rows - 1))) / spacing
     cdef double column = (azimuth + M_PI) * (columns / (2.0 * M_PI))
     row = min(max(row, 0.0), rows - 1.000001)
@@ -92,32 +97,45 @@ def place_ions(
     cdef const double *along = &deflection[0, 0, 0]
     cdef const double *across = &deflection[1, 0, 0]
     cdef double *node = &shared[0, 0]
-    cdef double x, y, z, a, b, sine, turned, upright, p, q, r, length
+    cdef double x[LANES]
+    cdef double y[LANES]
+    cdef double z[LANES]
+    cdef double a, b, sine, turned, upright, p, q, r, length
+    cdef Py_ssize_t group, first, lane, lanes
     cdef Cell cell
     with nogil:
-        for i in range(n):
-            x, y, z = apparent[i, 0], apparent[i, 1], apparent[i, 2]
+        # Some ions together: each step of a search waits for the one before, those of other ions do not.
+        for group in range((n + LANES - 1) // LANES):
+            first = group * LANES
+            lanes = min(<Py_ssize_t>LANES, n - first)
+            for lane in range(lanes):
+                i = first + lane
+                x[lane], y[lane], z[lane] = apparent[i, 0], apparent[i, 1], apparent[i, 2]
             for sweep in range(sweeps):
-                cell = cell_of(acos(min(max(y, -1.0), 1.0)), atan2(x, z), rows, columns, spacing)
-                a = at(along, &cell)
-                b = at(across, &cell)
-                sine = sqrt(max(1.0 - y * y, 1e-12))
-                turned, upright = x / sine, z / sine
-                p = apparent[i, 0] - a * y * turned - b * upright
-                q = apparent[i, 1] + a * sine
-                r = apparent[i, 2] - a * y * upright + b * turned
-                if sweep > 0:
-                    p = damping * p + (1.0 - damping) * x
-                    q = damping * q + (1.0 - damping) * y
-                    r = damping * r + (1.0 - damping) * z
-                length = 1.0 / sqrt(p * p + q * q + r * r)
-                x, y, z = p * length, q * length, r * length
-            cell = cell_of(acos(min(max(y, -1.0), 1.0)), atan2(x, z), rows, columns, spacing)
-            found[i, 0], found[i, 1], found[i, 2] = x, y, z
-            for j in range(k):
-                given[i, j] = at(&tables[j, 0, 0], &cell)
-            node[cell.corner] += (1.0 - cell.down) * (1.0 - cell.right)
-            node[cell.beside] += (1.0 - cell.down) * cell.right
-            node[cell.below] += cell.down * (1.0 - cell.right)
-            node[cell.opposite] += cell.down * cell.right
+                for lane in range(lanes):
+                    i = first + lane
+                    cell = cell_at(x[lane], y[lane], z[lane], rows, columns, spacing)
+                    a = at(along, &cell)
+                    b = at(across, &cell)
+                    sine = sqrt(max(1.0 - y[lane] * y[lane], 1e-12))
+                    turned, upright = x[lane] / sine, z[lane] / sine
+                    p = apparent[i, 0] - a * y[lane] * turned - b * upright
+                    q = apparent[i, 1] + a * sine
+                    r = apparent[i, 2] - a * y[lane] * upright + b * turned
+                    if sweep > 0:
+                        p = damping * p + (1.0 - damping) * x[lane]
+                        q = damping * q + (1.0 - damping) * y[lane]
+                        r = damping * r + (1.0 - damping) * z[lane]
+                    length = 1.0 / sqrt(p * p + q * q + r * r)
+                    x[lane], y[lane], z[lane] = p * length, q * length, r * length
+            for lane in range(lanes):
+                i = first + lane
+                cell = cell_at(x[lane], y[lane], z[lane], rows, columns, spacing)
+                found[i, 0], found[i, 1], found[i, 2] = x[lane], y[lane], z[lane]
+                for j in range(k):
+                    given[i, j] = at(&tables[j, 0, 0], &cell)
+                node[cell.corner] += (1.0 - cell.down) * (1.0 - cell.right)
+                node[cell.beside] += (1.0 - cell.down) * cell.right
+                node[cell.below] += cell.down * (1.0 - cell.right)
+                node[cell.opposite] += cell.down * cell.right
     return directions, values, counts

@@ -299,7 +299,8 @@ def _tell_surface(options, reconstruction):
     tell(options, reconstruction.verdict)
     for phase in reconstruction.phases:
         where = f", {phase.content:.1%} in {phase.matrix:.1%}" if phase.contrast == phase.contrast else ""
-        tell(options, f"evaporation field of {phase.name}{where}: {phase.ratio:.3f} ± {phase.error:.3f} of the matrix")
+        value = f"{phase.ratio:.3f} ± {phase.error:.3f} of the matrix" if phase.error == phase.error else "not found"
+        tell(options, f"evaporation field of {phase.name}{where}: {value}")
     found = {"verdict": reconstruction.verdict, "phases": [vars(phase) for phase in reconstruction.phases]}
     history = reconstruction.history
     if history is not None:

@@ -21,8 +21,10 @@ from apt_evap._common.validation import check_choice
 from apt_evap._core.surface_map import place_ions
 from apt_evap.reconstruction.spherical_harmonics import Coefficients, SphericalTransform
 
-_DEGREE = 44  # largest of the harmonics of the surface
-_CUTOFF = 24.0  # degree at which the volume of ions is damped to exp(-1/2)
+_CUTOFF = 24.0  # degree at which the volume of ions is damped to exp(-1/2), up to the following radius
+_CUTOFF_RADIUS = 22.0  # nm: beyond, it grows with the root of the radius, as the number of terraces across a view
+_LARGEST_CUTOFF = 96.0  # of a radius of 350 nm: the time grows with its cube
+_HIGHEST = 11 / 6  # degree of the harmonics of the surface over the cutoff
 _RING = 0.82  # of the half angle of the field of view, from which the ring reaches to its rim
 _RING_MEMORY = 1 / 13  # of the radius: depth over which the flux of the ring is averaged, 1 nm of R = 13 nm
 _STEP = 1 / 130  # of the radius: largest depth of a step
@@ -186,7 +188,8 @@ class EvolvingSurface:
 
     def __init__(self, ions: IonSequence) -> None:
         self.ions = ions
-        self.transform = transform = SphericalTransform(_DEGREE)
+        cutoff = min(_CUTOFF * max(1.0, math.sqrt(ions.radius / _CUTOFF_RADIUS)), _LARGEST_CUTOFF)
+        self.transform = transform = SphericalTransform(round(_HIGHEST * cutoff))
         polar, azimuth = transform.polar[:, None], transform.azimuths[None, :]
         sines, cosines = np.sin(polar), np.cos(polar)
         # The pole of the grid is y, and the azimuth starts behind the specimen: the axis is in the middle of the grid.
@@ -203,7 +206,7 @@ class EvolvingSurface:
         self._near = 0.5 * (1 - np.tanh((angles - _FRAME_TO) / math.radians(4.0)))
         degrees = transform.degrees.astype(np.float64)
         self._transfer = transfer(degrees)
-        self._damping = np.exp(-0.5 * (degrees / _CUTOFF) ** 2)
+        self._damping = np.exp(-0.5 * (degrees / cutoff) ** 2)
         fastest = float((self._transfer * degrees * (degrees + 1) * self._damping).max())
         self.step = ions.radius * min(_FORGOTTEN / fastest, _STEP)
 

@@ -179,9 +179,9 @@ def _two_binomials(fractions, neighbours):
     high = min(max(float(np.quantile(counts, 0.98)) / neighbours, 2 * low + 0.02), 0.999)
     low, share = min(low, high - 1e-3), 0.15
     for _ in range(_TURNS):
-        upper = share * scipy.stats.binom.pmf(numbers, neighbours, high)
-        lower = (1 - share) * scipy.stats.binom.pmf(numbers, neighbours, low)
-        belongs = upper / (upper + lower + 1e-300)
+        # the ratio of both probabilities, in which the binomial coefficient cancels
+        odds = numbers * np.log(high / low) + (neighbours - numbers) * np.log((1 - high) / (1 - low))
+        belongs = scipy.special.expit(odds + np.log(share / (1 - share)))
         share = float(np.clip((table * belongs).sum() / table.sum(), 1e-4, 0.9999))
         high = float((table * belongs * numbers).sum() / max((table * belongs).sum(), 1e-9) / neighbours)
         low = float((table * (1 - belongs) * numbers).sum() / max((table * (1 - belongs)).sum(), 1e-9) / neighbours)

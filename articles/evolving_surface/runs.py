@@ -70,6 +70,8 @@ def alloy(region, share):
 def case(name):
     """Phases beside the matrix, angle of the shank [degrees], emissions, radius of the apex [nm] and axis of a case."""
     name, *words = name.split("-")
+    name, _, percent = name.partition("@")
+    low = float(percent or 80) / 100
     shank = next((float(word.removeprefix("shank")) for word in words if word.startswith("shank")), 1.5)
     apex = next((float(word.removeprefix("R")) for word in words if word.startswith("R")), R)
     axis = next((tuple(map(int, word.removeprefix("axis"))) for word in words if word.startswith("axis")), AXIS)
@@ -79,7 +81,7 @@ def case(name):
         emissions["all"] = ae.RollUp(ae.TruncatedNormal(0.3 * ROLLING, 0.3 * ROLLING))
     phases = {
         "pure": lambda: [],
-        "sphere_low": lambda: [sphere("sphere", 0.8, apex=apex)],
+        "sphere_low": lambda: [sphere("sphere", low, apex=apex)],
         "sphere_low_off": lambda: [sphere("sphere", 0.8, 20, apex=apex)],
         "sphere_small": lambda: [sphere("sphere", 0.8, radius=SMALL, apex=apex)],
         "sphere_high": lambda: [sphere("sphere", 1.2, apex=apex)],
@@ -105,9 +107,11 @@ def case(name):
 
 CASES = (
     "pure:1-5 sphere_low:1-5 sphere_high:1-5 layer_high:1-5 two_spheres:1-5 layer_low-shank10:1-5 layer40_high:1 "
-    "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_small-R30:1 "
-    "sphere_high-rolled:1 sphere_low-axis111:1 sphere_high-axis111:1 core_shell-axis111:1 sphere_low-axis001:1 "
-    "sphere_high-axis001:1 sphere_low-axis011:1 sphere_high-axis011:1"
+    "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_small-R30:1-2 "
+    "two_spheres-R20:1 sphere_high-rolled:1 sphere_low-axis111:1-2 sphere_low@70-axis111:1 sphere_low@90-axis111:1 "
+    "sphere_high-axis111:1 core_shell-axis111:1 sphere_low-axis001:1-2 sphere_low@90-axis001:1 sphere_high-axis001:1 "
+    "sphere_low-axis011:1-2 sphere_low@90-axis011:1 sphere_high-axis011:1 sphere_low-axis113:1 sphere_low-axis122:1 "
+    "sphere_low@70:1 sphere_low@90:1"
 ).split()  # fmt: skip
 
 

@@ -31,6 +31,8 @@ GEOMETRIES = {
     "layer40_high": "layer at 40°, 1.15", "layer40_low": "layer at 40°, 0.85", "sphere_edge": "sphere at the rim, 0.85",
     "core_shell": "shell of 1.15 and core of 0.85", "alloy_sphere": "sphere of 40 % in 2 %",
     "sphere_small-R20": "sphere, 0.8, R = 20 nm", "sphere_small-R30": "sphere, 0.8, R = 30 nm",
+    "two_spheres-R20": "two small spheres, 0.8 and 1.2, R = 20 nm", "sphere_low@70": "sphere, 0.7",
+    "sphere_low@90": "sphere, 0.9",
     "sphere_high-rolled (metal)": "sphere, 1.2, rolling of aluminium",
     "sphere_high-rolled (all)": "sphere, 1.2, all ions roll", "grains": "two grains",
 }  # fmt: skip
@@ -41,12 +43,12 @@ GEOMETRIES |= {
 }
 GEOMETRIES |= {
     f"{name}-axis{axis}": f"{GEOMETRIES[name]}, axis [{axis}]"
-    for axis in ("111", "001", "011")
-    for name in ("sphere_low", "sphere_high", "core_shell")
+    for axis in ("111", "001", "011", "113", "122")
+    for name in ("sphere_low", "sphere_low@70", "sphere_low@90", "sphere_high", "core_shell")
 }
 PHASE_FIELDS = {
-    "sphere_low": [0.8], "sphere_small": [0.8], "sphere_low_off": [0.8], "sphere_high": [1.2],
-    "sphere_edge": [0.85], "layer_high": [1.15],
+    "sphere_low": [0.8], "sphere_low@70": [0.7], "sphere_low@90": [0.9], "sphere_small": [0.8],
+    "sphere_low_off": [0.8], "sphere_high": [1.2], "sphere_edge": [0.85], "layer_high": [1.15],
     "layer_low": [0.85], "layer40_high": [1.15], "layer40_low": [0.85], "two_spheres": [0.8, 1.2],
     "core_shell": [1.15, 0.85], "pure": [], "grains": [1.0],
 }  # fmt: skip

@@ -93,6 +93,18 @@ def test_with_a_phase_inside_it_is_the_mean_of_voltage_and_rim_where_less_flux_i
     np.testing.assert_allclose(plain.recession_changes(), crystal, atol=1e-12)
 
 
+def test_of_a_phase_that_leaves_in_bursts_no_field_is_found():
+    hits, _ = ions_of(20_000, voltage=varying(20_000))
+    depth, window = ae.reconstruct(hits, radius=13.0, **KNOWN).depths, 0.4 * KNOWN["atomic_volume"] ** (1 / 3)
+    inside = (np.hypot(hits.x, hits.y) < 30) & (depth > 1.0)
+    steady, bursts = evolving(hits, labels=inside), evolving(hits, labels=inside & (depth % (2 * window) < window))
+    assert steady.followed_by == "both" and "bursts" not in steady.verdict
+    assert bursts.followed_by == "volume" and np.isnan([bursts.phases[0].ratio, bursts.phases[0].error]).all()
+    assert "leave varies by 1." in bursts.verdict and "± nan" not in repr(bursts)
+    np.testing.assert_array_equal(bursts.positions, evolving(hits).positions)
+    assert np.isfinite(ae.reconstruction.position_covariances(bursts)).all()
+
+
 @pytest.mark.parametrize("at_rim", [False, True])
 def test_a_phase_whose_ions_are_all_at_the_beginning_has_no_field(at_rim):
     hits, _ = ions_of(8000, voltage=varying(8000))
@@ -320,7 +332,7 @@ def test_a_field_is_as_sure_as_the_content_that_it_is_said_for():
     rng = np.random.default_rng(6)
     values = 1 + 0.1 * feature.membership + 0.01 * rng.standard_normal(len(feature.own))
     found = LocalComposition(*[0.02 + 0.18 * feature.membership] * 3)
-    measured = module._Measured(ions, values, ("Cu",), (feature.own,), False, 0)
+    measured = module._Measured(ions, values, ("Cu",), (feature.own,), False, 0, 0.0166)
     errors = []
     for content_error in (0.0, 0.09):
         one = replace(feature, content_error=content_error)

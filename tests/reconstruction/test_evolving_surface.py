@@ -228,3 +228,26 @@ def test_the_bits_do_not_depend_on_the_threads():
         )
         digests.add(run.stdout)
     assert len(digests) == 1
+
+
+def test_ions_that_are_searched_together_have_the_origins_that_each_has_alone():
+    surface = surface_of(2000)
+    apparent, rng = np.ascontiguousarray(surface.ions.directions[:19]), np.random.default_rng(3)
+    deflection, table = (
+        rng.normal(0, 0.02, (2, *surface.nodes.shape[:2])),
+        rng.normal(size=(1, *surface.nodes.shape[:2])),
+    )
+    together = surface.origins(apparent, deflection, table)
+    alone = [surface.origins(apparent[[ion]], deflection, table) for ion in range(19)]
+    for k in (0, 1):
+        np.testing.assert_array_equal(together[k], np.concatenate([one[k] for one in alone]))
+    np.testing.assert_allclose(together[2], sum(one[2] for one in alone), atol=1e-14)
+
+
+@pytest.mark.parametrize(("radius", "degree"), [(3.0, 44), (20.0, 44), (30.0, 51), (88.0, 88), (2000.0, 176)])
+def test_degrees_grow_with_the_root_of_large_radii(radius, degree):
+    surface = EvolvingSurface(IonSequence(even_flux(10, RIM), VOLUME, RIM, radius))
+    assert surface.transform.degree == degree
+    orders = np.arange(degree + 1)
+    rates = transfer(orders) * orders * (orders + 1) * np.exp(-0.5 * (orders * 11 / 6 / degree) ** 2)
+    assert surface.step == pytest.approx(0.7 * radius / rates.max(), rel=0.02)  # 0.7 of the time of the fastest degree

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import scipy
 
+from apt_evap.reconstruction import local_composition as module
 from apt_evap.reconstruction.beyond_view import Feature, continued
 from apt_evap.reconstruction.local_composition import (
     contents,
@@ -64,6 +66,23 @@ def test_contents_are_those_of_the_matrix_and_the_phase_without_their_interface(
         differences.append((content - phase) / error)
     # a mixture of two binomials alone gives 0.17 to 0.18 for 0.2, and 0.35 to 0.36 for 0.4
     assert abs(np.mean(differences)) < 1.5 and np.abs(differences).max() < 3.5
+
+
+@pytest.mark.parametrize(("matrix", "phase"), [(0.02, 0.06), (0.02, 0.4), (0.3, 0.9)])
+def test_contents_of_counts_are_those_of_two_binomials_of_the_greatest_likelihood(matrix, phase):
+    rng = np.random.default_rng(8)
+    counts = rng.binomial(250, np.where(rng.random(20_000) < 0.1, phase, matrix))
+    low, high = module._two_binomials(counts / 250, 250)
+    errors = (np.sqrt(one * (1 - one) / 250 / ions) for one, ions in ((matrix, 18_000), (phase, 2000)))
+    assert [low, high] == [
+        pytest.approx(one, abs=4 * error) for one, error in zip((matrix, phase), errors, strict=True)
+    ]
+
+    def likelihood(low, high):
+        lower, upper = (scipy.stats.binom.pmf(counts, 250, one) for one in (low, high))
+        return np.log(0.9 * lower + 0.1 * upper).sum()
+
+    assert all(likelihood(low, high) > likelihood(low, high + step) for step in (-0.005, 0.005))
 
 
 def test_a_core_has_neighbours_of_its_own_kind_or_as_many_as_leave_a_hundred_ions():
