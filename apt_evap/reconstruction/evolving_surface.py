@@ -22,8 +22,9 @@ from apt_evap._core.surface_map import place_ions
 from apt_evap.reconstruction.spherical_harmonics import Coefficients, SphericalTransform
 
 _CUTOFF = 24.0  # degree at which the volume of ions is damped to exp(-1/2), up to the following radius
-_CUTOFF_RADIUS = 22.0  # nm: beyond, it grows with the root of the radius, as the number of terraces across a view
-_LARGEST_CUTOFF = 96.0  # of a radius of 350 nm: the time grows with its cube
+_CUTOFF_RADIUS = 22.0  # nm: beyond, it grows with the root of the radius, as the number of terraces across a view,
+_CUTOFF_IONS = 60_000  # if there are more ions than these in one radius of depth: their noise limits it
+_LARGEST_CUTOFF = 64.0  # of a radius of 156 nm
 _HIGHEST = 11 / 6  # degree of the harmonics of the surface over the cutoff
 _RING = 0.82  # of the half angle of the field of view, from which the ring reaches to its rim
 _RING_MEMORY = 1 / 13  # of the radius: depth over which the flux of the ring is averaged, 1 nm of R = 13 nm
@@ -188,7 +189,9 @@ class EvolvingSurface:
 
     def __init__(self, ions: IonSequence) -> None:
         self.ions = ions
-        cutoff = min(_CUTOFF * max(1.0, math.sqrt(ions.radius / _CUTOFF_RADIUS)), _LARGEST_CUTOFF)
+        # the variance of what ions add to the divergence of the map is the 7/2th power of the degree over their number
+        of_noise = (ions.swept * ions.radius**3 / ions.volume / _CUTOFF_IONS) ** (2 / 7)
+        cutoff = min(_CUTOFF * max(1.0, min(math.sqrt(ions.radius / _CUTOFF_RADIUS), of_noise)), _LARGEST_CUTOFF)
         self.transform = transform = SphericalTransform(round(_HIGHEST * cutoff))
         polar, azimuth = transform.polar[:, None], transform.azimuths[None, :]
         sines, cosines = np.sin(polar), np.cos(polar)

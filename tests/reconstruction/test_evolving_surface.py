@@ -244,9 +244,21 @@ def test_ions_that_are_searched_together_have_the_origins_that_each_has_alone():
     np.testing.assert_allclose(together[2], sum(one[2] for one in alone), atol=1e-14)
 
 
-@pytest.mark.parametrize(("radius", "degree"), [(3.0, 44), (20.0, 44), (30.0, 51), (88.0, 88), (2000.0, 176)])
-def test_degrees_grow_with_the_root_of_large_radii(radius, degree):
-    surface = EvolvingSurface(IonSequence(even_flux(10, RIM), VOLUME, RIM, radius))
+@pytest.mark.parametrize(
+    ("radius", "ions", "degree"),
+    [
+        (3.0, 1e6, 44),
+        (20.0, 1e6, 44),
+        (30.0, 1e6, 51),
+        (88.0, 1e7, 88),
+        (88.0, 6e4, 44),
+        (88.0, 24e4, 65),
+        (900.0, 1e8, 117),
+    ],
+)
+def test_degrees_grow_with_the_root_of_large_radii_if_there_are_ions_for_it(radius, ions, degree):
+    volume = math.pi * math.sin(RIM) ** 2 * radius**3 / ions  # this many in one radius of depth
+    surface = EvolvingSurface(IonSequence(even_flux(10, RIM), volume, RIM, radius))
     assert surface.transform.degree == degree
     orders = np.arange(degree + 1)
     rates = transfer(orders) * orders * (orders + 1) * np.exp(-0.5 * (orders * 11 / 6 / degree) ** 2)
