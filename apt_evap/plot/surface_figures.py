@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from textwrap import fill
+
 import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
@@ -15,6 +17,7 @@ from apt_evap.spectra.mass_ranges import Ranges
 _TIMES = (0.25, 0.5, 0.75)  # of the depth, at which the field is drawn
 _COLORS = ("0.75", "C3", "C0", "C2", "C4", "C5", "C6", "0.4")  # the matrix is grey
 _DOTS = 12_000
+_CHARACTERS = 150  # of a line of the title
 
 
 @with_default_settings
@@ -68,8 +71,9 @@ def surface_history(
         fontsize="small", markerscale=2, ncols=4, loc="upper center", bbox_to_anchor=(0.5, 0), borderaxespad=4.5
     )
     axes[2].plot(history.depths, history.recession, color="C0", label="recession over that of a cap")
-    axes[2].plot(history.depths, history.voltage, color="C1", label="voltage, measured")
-    axes[2].plot(history.depths, history.model_voltage, color="C3", lw=1, label="voltage, of the surface")
+    if not np.isnan(history.voltage).all():  # none is measured, or none was followed
+        axes[2].plot(history.depths, history.voltage, color="C1", label="voltage, measured")
+        axes[2].plot(history.depths, history.model_voltage, color="C3", lw=1, label="voltage, of the surface")
     axes[2].set(xlabel="depth of the apex [nm]", ylabel="relative to the matrix on a sphere")
     axes[2].legend(fontsize="small")
     depths = [part * float(history.depths[-1]) for part in _TIMES]
@@ -84,7 +88,7 @@ def surface_history(
         ax.set(xlabel="x / R", ylabel="y / R")
         set_title(ax, f"field at a depth of {depth:.1f} nm")
     add_colorbar(images, axes[5], label="field / mean of the sphere")
-    figure.suptitle(result.verdict if title is None else title, parse_math=False)
+    figure.suptitle(fill(result.verdict, _CHARACTERS) if title is None else title, parse_math=False, fontsize="medium")
     return np.asarray(axes)
 
 
