@@ -855,10 +855,11 @@ def _placed(cap, measured, fixed, every, why, thinned):
     known = list(known)
     for k, feature in zip(seen, fixed.features, strict=False):  # no features: no contrast was seen
         known[k] = replace(known[k], matrix=feature.background, phase=feature.content)
+    ratios = np.where(np.isnan(fixed.errors), np.nan, fixed.ratios)
     phases = tuple(
         PhaseField(
-            name, float(fixed.ratios[k] + 0 * fixed.errors[k]), float(fixed.errors[k]), int(measured.own[k].sum()),
-            known[k].matrix, known[k].phase, known[k].contrast,
+            name, float(ratios[k]), float(fixed.errors[k]), int(measured.own[k].sum()), known[k].matrix,
+            known[k].phase, known[k].contrast,
         )
         for name, k in numbers.items()
     )  # fmt: skip

@@ -109,7 +109,7 @@ def phase_sizes(
         blur = (_semi_axes(usual[near], weights, 0 * scatter) - axes) / 2
         counts = axes * math.sqrt(float((weights**2).sum())) / float(weights.sum()) / math.sqrt(2)
         covariance = changes.T @ changes + np.diag(blur**2 + counts**2)
-        if reconstruction.followed_by == "volume":  # in bursts
+        if reconstruction.followed_by == "volume":  # although there are phases: they leave in bursts
             covariance[0, 0] += (BURST_WIDTH * axes[0]) ** 2
         (lateral, depth), (across, along) = axes.tolist(), np.sqrt(np.diag(covariance)).tolist()
         correlation = float(covariance[0, 1]) / (across * along)

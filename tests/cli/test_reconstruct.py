@@ -15,6 +15,7 @@ from apt_evap.cli.main import main
 from apt_evap.fit import crystal_constants
 from apt_evap.fit.crystal_constants import CrystalConstants, PoleSpacing
 from apt_evap.reconstruction.constants import run_constants
+from apt_evap.reconstruction.evolving import PhaseField
 from apt_evap.reconstruction.origins import OriginTable
 from apt_evap.reconstruction.phase_size import PhaseSize
 from apt_evap.reconstruction.specimen_check import SpecimenCheck
@@ -254,6 +255,18 @@ def test_the_specimen_of_a_check_has_crystal_and_axis_of_the_options_or_of_the_r
     ):
         material, found = reconstruct._crystal(Namespace(shape="evolving", check=check), settings, crystal)
         assert (material.name, found) == (name, axis)
+
+
+def test_a_field_that_was_not_found_is_no_number(capsys):
+    found = PhaseField("Cu", 1.2, 0.03, 90, 0.02, 0.4, 12.0)
+    missing = PhaseField("label 1", np.nan, np.nan, 90, 0.0, 1.0, np.nan)
+    told = Namespace(verdict="as told", phases=(found, missing), history=None)
+    reconstruct._tell_surface(Namespace(quiet=False, json=False), told)
+    assert capsys.readouterr().out.splitlines() == [
+        "as told",
+        "evaporation field of Cu, 40.0% in 2.0%: 1.200 ± 0.030 of the matrix",
+        "evaporation field of label 1: not found",
+    ]
 
 
 @pytest.mark.slow  # a minute: the example, and two simulations of what is found in it

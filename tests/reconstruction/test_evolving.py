@@ -103,11 +103,8 @@ def test_of_a_phase_that_leaves_in_bursts_no_field_is_found():
     assert "leave varies by 1." in bursts.verdict and "± nan" not in repr(bursts)
     np.testing.assert_array_equal(bursts.positions, evolving(hits).positions)
     assert np.isfinite(ae.reconstruction.position_covariances(bursts)).all()
-    for found, part in (
-        (steady, 0.0),
-        (bursts, 0.1),
-    ):  # of the width of phases that leave in bursts a tenth is in doubt
-        exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+    exact = dict.fromkeys(("compression", "radius", "efficiency"), 0.0)
+    for found, part in ((steady, 0.0), (bursts, 0.1)):  # a tenth of the width is in doubt, beside the counts
         (size,) = ae.reconstruction.phase_sizes(found, exact, (0.0, 0.0))
         assert size.lateral_error == pytest.approx(part * size.lateral, abs=0.03 * size.lateral)
     figures = [ae.plot.surface_history(found) for found in (steady, bursts)]
