@@ -108,10 +108,10 @@ def case(name):
 CASES = (
     "pure:1-5 sphere_low:1-5 sphere_high:1-5 layer_high:1-5 two_spheres:1-5 layer_low-shank10:1-5 layer40_high:1 "
     "layer40_low:1 sphere_edge:1 core_shell:1 grains:1 alloy_sphere:1 sphere_small-R20:1 sphere_small-R30:1-2 "
-    "two_spheres-R20:1 sphere_high-rolled:1 sphere_low-axis111:1-2 sphere_low@70-axis111:1 sphere_low@90-axis111:1 "
-    "sphere_high-axis111:1 core_shell-axis111:1 sphere_low-axis001:1-2 sphere_low@90-axis001:1 sphere_high-axis001:1 "
-    "sphere_low-axis011:1-2 sphere_low@90-axis011:1 sphere_high-axis011:1 sphere_low-axis113:1 sphere_low-axis122:1 "
-    "sphere_low@70:1 sphere_low@90:1"
+    "two_spheres-R20:1 sphere_high-rolled:1 sphere_low-axis111:1-3 sphere_low@70-axis111:1 sphere_low@90-axis111:1 "
+    "sphere_high-axis111:1 core_shell-axis111:1 sphere_low-axis001:1-3 sphere_low@90-axis001:1 sphere_high-axis001:1 "
+    "sphere_low-axis011:1-3 sphere_low@90-axis011:1 sphere_high-axis011:1 sphere_low-axis113:1 sphere_low-axis122:1 "
+    "sphere_low@70:1 sphere_low@90:1 sphere_low@75-axis001:1"
 ).split()  # fmt: skip
 
 
